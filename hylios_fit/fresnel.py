@@ -1,0 +1,140 @@
+"""Interfaces: Fresnel reflectance, refraction, and the rough skin surface.
+
+Directions are unit vectors with z pointing into the skin. A smooth interface has the normal
+(0, 0, -1); the rough surface draws a facet for every impact (paper, section 4.3).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+def reflectance(
+    cos_i: Float[Array, "..."], n1: Float[Array, "..."], n2: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Fresnel reflectance of unpolarised light that meets n2 coming from n1.
+
+    `cos_i` is the cosine of the angle of incidence, in [0, 1]. Total internal reflection gives 1.
+    Born and Wolf, Principles of Optics, section 1.5.
+    """
+    cos_t = refracted_cosine(cos_i, n1, n2)
+    # a floor keeps 0/0 out of grazing incidence between equal indices
+    tiny = jnp.finfo(jnp.result_type(cos_i)).tiny
+    r_s = (n1 * cos_i - n2 * cos_t) / jnp.maximum(n1 * cos_i + n2 * cos_t, tiny)
+    r_p = (n2 * cos_i - n1 * cos_t) / jnp.maximum(n2 * cos_i + n1 * cos_t, tiny)
+    return jnp.where(cos_t > 0, 0.5 * (r_s**2 + r_p**2), 1.0)
+
+
+def refracted_cosine(
+    cos_i: Float[Array, "..."], n1: Float[Array, "..."], n2: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Cosine of the refracted ray by Snell's law; 0 where all light is reflected."""
+    sin2 = (n1 / n2) ** 2 * (1.0 - cos_i**2)
+    inside = sin2 < 1.0
+    return jnp.where(inside, jnp.sqrt(jnp.where(inside, 1.0 - sin2, 1.0)), 0.0)
+
+
+def facet_density(cos_s: Float[Array, "..."], roughness: Float[Array, ""]) -> Float[Array, "..."]:
+    """Eq. 8 as a density of the facet's polar cosine on [0, 1], normalised (Trowbridge and Reitz)."""
+    s2 = roughness**2
+    k = jnp.sqrt(1.0 - s2)
+    # integral of 1/(1 - k^2 x^2)^2 over [0, 1]
+    norm = 0.5 / s2 + 0.5 * jnp.arctanh(k) / k
+    return 1.0 / (norm * (1.0 - k**2 * cos_s**2) ** 2)
+
+
+@lru_cache(maxsize=32)
+def facet_table(roughness: float, size: int = 2049) -> np.ndarray:
+    """Polar cosine of the facet (Eq. 8) at `size` equal steps of its cumulative distribution.
+
+    Linear interpolation in it is the sampler of both walks. A roughness of 0 is a mirror.
+    """
+    if roughness <= 0:
+        return np.ones(size)
+    s2 = roughness**2
+    k = np.sqrt(max(1.0 - s2, 1e-12))
+
+    def distance_from_top(tan2):  # 1 - CDF in x = cos, written so that nothing cancels near x = 1
+        x = 1.0 / np.sqrt(1.0 + tan2)
+        return x, 0.5 * x / (1.0 - k**2 * x**2) + 0.5 * np.arctanh(k * x) / k
+
+    tan = np.concatenate([[0.0], np.geomspace(1e-4 * roughness, 1e6, 40_000)])
+    x, upper = distance_from_top(tan**2)
+    cdf = 1.0 - upper / upper[0]
+    return np.interp(np.linspace(0.0, 1.0, size), cdf, x)
+
+
+def basis(u: tuple[Array, Array, Array]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Two unit vectors that complete `u` to an orthonormal basis (Duff et al., JCGT 2017)."""
+    ux, uy, uz = u
+    sign = jnp.where(uz >= 0, 1.0, -1.0).astype(uz.dtype)
+    a = -1.0 / (sign + uz)
+    b = ux * uy * a
+    return (1.0 + sign * ux * ux * a, sign * b, -sign * ux), (b, sign + uy * uy * a, -uy)
+
+
+def interact(
+    u: tuple[Array, Array, Array],
+    facet: tuple[Array, Array, Array],
+    n1: Array,
+    n2: Array,
+    xi: Array,
+) -> tuple[Array, Array, tuple[Array, Array, Array]]:
+    """A Fresnel test on a facet.
+
+    `facet` is the facet's normal, pointing to the side that the ray comes from, and `xi` a uniform
+    number. Returns (valid, transmitted, direction). Where the facet faces away from the ray, or
+    would send the outcome to the wrong side of the mean surface, `valid` is false: that facet
+    is drawn again.
+    """
+    cos_i = -(u[0] * facet[0] + u[1] * facet[1] + u[2] * facet[2])
+    c = jnp.clip(cos_i, 0.0, 1.0)
+    cos_t = refracted_cosine(c, n1, n2)
+    transmitted = xi >= reflectance(c, n1, n2)
+    ratio = n1 / n2
+    along_u = jnp.where(transmitted, ratio, 1.0)
+    along_n = jnp.where(transmitted, ratio * c - cos_t, 2.0 * c)
+    out = tuple(along_u * ui + along_n * ni for ui, ni in zip(u, facet, strict=True))
+    norm = jax.lax.rsqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)  # rounding would add up otherwise
+    out = (out[0] * norm, out[1] * norm, out[2] * norm)
+    # the mean normal points to the side of the incoming ray: -sign(uz)
+    side = jnp.where(transmitted, 1.0, -1.0) * jnp.sign(u[2])
+    valid = (cos_i > 0) & (out[2] * side > 0)
+    return valid, transmitted, out
+
+
+@lru_cache(maxsize=64)
+def surface_reflectance(
+    incidence: float, n1: float, n2: float, roughness: float, size: int = 512
+) -> float:
+    """Share of the light that the skin's surface reflects at once.
+
+    `incidence` in radians. A quadrature over the facets of Eq. 8 in the same terms as the walks
+    draw them: facets that face away or send the light to the wrong side do not count.
+    """
+    table = facet_table(roughness)
+    cos_s = np.interp((np.arange(size) + 0.5) / size, np.linspace(0, 1, len(table)), table)
+    phi = np.pi * (np.arange(size) + 0.5) / size
+    sin_s = np.sqrt(1.0 - cos_s**2)
+    c, s = np.meshgrid(cos_s, np.cos(phi), indexing="ij")
+    facet_x = sin_s[:, None] * s
+    ux, uz = np.sin(incidence), np.cos(incidence)
+    cos_i = c * uz - facet_x * ux
+    facing = cos_i > 0
+    ci = np.clip(cos_i, 0.0, 1.0)
+    sin2 = (n1 / n2) ** 2 * (1.0 - ci**2)
+    cos_t = np.sqrt(np.clip(1.0 - sin2, 0.0, None))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        r_s = (n1 * ci - n2 * cos_t) / (n1 * ci + n2 * cos_t)
+        r_p = (n2 * ci - n1 * cos_t) / (n2 * ci + n1 * cos_t)
+    share = np.where(sin2 < 1.0, 0.5 * (r_s**2 + r_p**2), 1.0)
+    up = uz - 2.0 * ci * c < 0  # the reflected ray leaves
+    down = (n1 / n2) * uz - ((n1 / n2) * ci - cos_t) * c > 0
+    reflected = np.mean(np.where(facing & up, share, 0.0))
+    entered = np.mean(np.where(facing & down, 1.0 - share, 0.0))
+    return float(reflected / (reflected + entered))

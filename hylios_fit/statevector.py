@@ -1,0 +1,313 @@
+"""The state vector: names, order, bounds, priors and transforms of the free parameters.
+
+A parameter `x` of the surrogate's box is a monotone function of an unbounded variable `u` with a
+unit normal prior,
+
+    f(x) = f_lower + (f_upper - f_lower) / (1 + exp(-(a + b u))),
+
+where `f` is log(x + offset) for contents and the identity for the rest; `a` and `b` are set so
+that u = 0 is the prior's median and the slope there its standard deviation in `f`. Every `u` is
+inside the box, and prior draws are exact. The variables of the pigment contents are correlated
+(dark skin is dark in every stratum), and so are those of blood; the Cholesky factor of that
+correlation whitens them: u = mean + factor z with z a unit normal. Solvers and samplers work in z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hylios_fit.errors import HyliosError
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Prior of one parameter, from physiology.
+
+    `median` is in the parameter's unit; `sd` in log(x + offset) where `offset` is given, else in
+    the parameter's unit. `factor` is a variable shared with the other parameters of that name,
+    `loading` the correlation with it.
+    """
+
+    median: float
+    sd: float
+    offset: float | None = None
+    factor: str = ""
+    loading: float = 0.0
+    source: str = ""
+
+
+_TABLE_I = "Table I of Chen et al. 2015 (S1 to S4), after Kollias 1991 and Hennessy 2005"
+
+#: The declared order is that of the surrogate; the names and priors are these. Together the
+#: first six give a prior of melanin per volume of epidermis from about 0.3 to 15 mg/mL (2 sd).
+PRIORS: Mapping[str, Prior] = {
+    # Table I: 0 to 10 % in granulosum and spinosum, 1 to 10 % in basale. Light skin has few or
+    # none above the basale, dark skin as many there (Szabo 1969, Olson 1973): the medians fall
+    # and the spreads widen upwards. The offset lets a content be practically nothing.
+    "melanosome_granulosum": Prior(1.0, 1.1, 0.3, "melanisation", 0.7, _TABLE_I),
+    "melanosome_spinosum": Prior(1.5, 1.0, 0.3, "melanisation", 0.75, _TABLE_I),
+    "melanosome_basale": Prior(3.2, 0.95, 0.3, "melanisation", 0.8, _TABLE_I),
+    # Table I: 0.8 to 15 %.
+    "colloidal_melanin": Prior(2.2, 1.2, 0.1, "melanisation", 0.85, _TABLE_I),
+    # Table I: 32 to 90 mg/mL and 2 to 4 mg/mL; the spreads are wider, for red hair and albinism
+    # do not end at four specimens.
+    "eumelanin": Prior(55.0, 0.55, 0.0, source=_TABLE_I),
+    "pheomelanin": Prior(2.8, 0.7, 0.0, source=_TABLE_I),
+    # 0.2 to 4 % of the dermis (Jacques 1996; Angelopoulou 2001; Table I: 0.2 to 2.5 %), the same
+    # perfusion in both plexus as a rule.
+    "blood_papillary": Prior(0.9, 0.75, 0.0, "perfusion", 0.75, "Jacques 1996; Table I"),
+    "blood_reticular": Prior(0.9, 0.75, 0.0, "perfusion", 0.75, "Jacques 1996; Table I"),
+    # Dermal capillaries and venules to arterioles: 0.4 to 0.95 (Zonios 2001; Stratonnikov 2001).
+    "oxygen_saturation": Prior(0.72, 0.15, source="Zonios 2001; Stratonnikov and Loschenov 2001"),
+    # 0.7 to 1.1 of the default content (Blank 1952: up to 40 % loss; Nakagawa 2010).
+    "water": Prior(0.95, 0.12, source="Blank 1952; Nakagawa 2010"),
+    # No population study found for the dermis: within a factor two of the default.
+    "lipids": Prior(1.0, 0.35, source="assumed, within a factor of two"),
+}
+
+#: Conditioning on a held value at the very edge of the box would put its variable at infinity.
+_U_LIMIT = 3.0
+
+#: Weights of granulosum, spinosum and basale (thickness 0.0033 cm each) and of papillary and
+#: reticular dermis (0.02 and 0.1 cm) in what is meant per volume; water of the dermis in %.
+EPIDERMIS_CM = (0.0033, 0.0033, 0.0033)
+DERMIS_CM = (0.02, 0.1)
+DERMIS_WATER_PERCENT = 75.0
+
+
+class StateVector(eqx.Module):
+    """The free parameters of one inversion, as a function of the whitened state.
+
+    `P` counts the surrogate's continuous parameters, `N` the free ones. A pytree: two vectors
+    with the same names compile to the same program, whatever their held values.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    """(P) all parameters, in the surrogate's order."""
+    free: tuple[str, ...] = eqx.field(static=True)
+    """(N) the free ones, in the same order."""
+    lower: np.ndarray
+    upper: np.ndarray
+    """(P,) the box, in the units of the parameters."""
+    logarithmic: np.ndarray
+    offset: np.ndarray
+    shift: np.ndarray
+    slope: np.ndarray
+    """(P,) `a` and `b` of the transform."""
+    mean: np.ndarray
+    """(N,) prior mean of u, given the held values."""
+    factor: np.ndarray
+    """(N, N) lower triangular; prior covariance of u is factor @ factor.T."""
+    held: np.ndarray
+    """(P,) values of the held parameters, the prior's median where free."""
+
+    @property
+    def index(self) -> np.ndarray:
+        """(N,) positions of the free parameters among all."""
+        return np.array([self.names.index(name) for name in self.free], dtype=int)
+
+    def u(self, z: Float[Array, "... N"]) -> Float[Array, "... N"]:
+        """The unbounded variables of the free parameters."""
+        z = jnp.asarray(z)
+        u = z @ jnp.asarray(self.factor.T, z.dtype)
+        return u + jnp.broadcast_to(jnp.asarray(self.mean, z.dtype), u.shape)
+
+    def from_u(self, u: Float[Array, "... N"]) -> Float[Array, "... N"]:
+        """Values of the free parameters, inside the box, from their unbounded variables."""
+        u = jnp.asarray(u)
+
+        def pick(values: Any) -> Array:
+            return jnp.broadcast_to(jnp.asarray(values[self.index], u.dtype), u.shape)
+
+        lower, upper = pick(self.lower), pick(self.upper)
+        offset = pick(self.offset)
+        logarithmic = jnp.broadcast_to(self.logarithmic[self.index], u.shape)
+        share = jax.nn.sigmoid(pick(self.shift) + pick(self.slope) * u)
+        # A safe stand-in keeps the branch that is not taken free of NaN, and so its gradient.
+        base = jnp.where(logarithmic, lower + offset, 1.0)
+        span = jnp.where(logarithmic, jnp.log((upper + offset) / base), 0.0)
+        value = lower + jnp.where(
+            logarithmic, base * jnp.expm1(span * share), (upper - lower) * share
+        )
+        return jnp.clip(value, lower, upper)
+
+    def parameters(self, z: Float[Array, "... N"]) -> Float[Array, "... P"]:
+        """All parameters of the surrogate, inside its box, from the whitened state."""
+        free = self.from_u(self.u(z))
+        held = jnp.asarray(self.held, free.dtype)
+        whole = jnp.broadcast_to(held, (*free.shape[:-1], len(self.names)))
+        return whole.at[..., self.index].set(free)
+
+    def state(self, parameters: Float[Array, "... P"]) -> np.ndarray:
+        """The whitened state of given parameters; the held ones are not looked at.
+
+        Raises `HyliosError` for a value at or beyond the edge of the box, where it is infinite.
+        """
+        values = np.asarray(parameters, dtype=np.float64)[..., self.index]
+        u = _to_u(self, values, self.index)
+        if not np.all(np.isfinite(u)):
+            at = [self.free[i] for i in np.unique(np.argwhere(~np.isfinite(u))[:, -1])]
+            raise HyliosError(f"not inside the surrogate's range: {', '.join(at)}")
+        return np.linalg.solve(self.factor, (u - self.mean)[..., None])[..., 0]
+
+    def prior_draws(self, key: Array, count: int) -> np.ndarray:
+        """(count, P) parameters drawn from the prior, float64."""
+        z = np.asarray(jax.random.normal(key, (count, len(self.free))), dtype=np.float64)
+        with jax.enable_x64(True):
+            return np.asarray(self.parameters(jnp.asarray(z)))
+
+    def edge_share(self, z: np.ndarray) -> np.ndarray:
+        """(N,) where each free parameter lies in its range: 0 at the lower edge, 1 at the upper.
+
+        Measured in log(x + offset) for contents.
+        """
+        u = self.mean + np.asarray(z) @ self.factor.T
+        exponent = self.shift[self.index] + self.slope[self.index] * u
+        return 1.0 / (1.0 + np.exp(-np.clip(exponent, -700.0, 700.0)))
+
+
+def _to_u(vector: StateVector, values: np.ndarray, index: np.ndarray) -> np.ndarray:
+    lower, upper = vector.lower[index], vector.upper[index]
+    logarithmic, offset = vector.logarithmic[index], vector.offset[index]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        base = np.where(logarithmic, lower + offset, 1.0)
+        share = np.where(
+            logarithmic,
+            np.log1p((values - lower) / base) / np.log((upper + offset) / base),
+            (values - lower) / (upper - lower),
+        )
+        exponent = np.log(share) - np.log1p(-share)
+    return (exponent - vector.shift[index]) / vector.slope[index]
+
+
+def prior_correlation(names: Iterable[str]) -> np.ndarray:
+    """(P, P) correlation of the unbounded variables: product of the loadings on a shared factor."""
+    priors = [PRIORS[name] for name in names]
+    loading = np.array([prior.loading for prior in priors])
+    shared = np.array([[a.factor == b.factor != "" for b in priors] for a in priors])
+    correlation = np.outer(loading, loading) * shared
+    np.fill_diagonal(correlation, 1.0)
+    return correlation
+
+
+def state_vector(
+    names: Iterable[str],
+    lower: Any,
+    upper: Any,
+    free: Iterable[str] | None = None,
+    fix: Mapping[str, float] | None = None,
+) -> StateVector:
+    """The state vector for a surrogate's parameters and box.
+
+    `names` (P), `lower` and `upper` (P,): the surrogate's. `free`: which vary (all that are not
+    fixed, if None); the others stay at the median of their prior. `fix`: values that are known;
+    the prior of the free ones is conditioned on them.
+
+    Raises `HyliosError` for an unknown name, a value outside the box, a name both free and fixed,
+    nothing left free, or a parameter that has no declared prior.
+    """
+    names = tuple(names)
+    lower, upper = (np.asarray(edge, dtype=np.float64) for edge in (lower, upper))
+    fix = dict(fix or {})
+    known = ", ".join(names)
+    for name in (*([] if free is None else (free := tuple(free))), *fix):
+        if name not in names:
+            raise HyliosError(f"unknown parameter {name!r}; the surrogate knows: {known}")
+    undeclared = [name for name in names if name not in PRIORS]
+    if undeclared:
+        raise HyliosError(
+            f"no prior is declared for {', '.join(undeclared)}: add it to statevector.PRIORS"
+        )
+    both = set(free or ()) & set(fix)
+    if both:
+        raise HyliosError(f"both free and fixed: {', '.join(sorted(both))}")
+    for name, value in fix.items():
+        low, high = lower[names.index(name)], upper[names.index(name)]
+        if not low <= float(value) <= high:
+            raise HyliosError(
+                f"{name} = {value} is outside the surrogate's range {low:g} to {high:g}"
+            )
+    chosen = tuple(n for n in names if n not in fix and (free is None or n in free))
+    if not chosen:
+        raise HyliosError(f"nothing is free: leave at least one of {known}")
+
+    priors = [PRIORS[name] for name in names]
+    logarithmic = np.array([prior.offset is not None for prior in priors])
+    offset = np.array([prior.offset or 0.0 for prior in priors])
+    median = np.array([prior.median for prior in priors])
+    sd = np.array([prior.sd for prior in priors])
+    bad = ~((lower < median) & (median < upper))
+    bad |= logarithmic & (lower + offset <= 0.0)
+    if bad.any():
+        at = names[int(np.argmax(bad))]
+        raise HyliosError(
+            f"the surrogate's range of {at} does not hold the prior's median {PRIORS[at].median}"
+        )
+    base = np.where(logarithmic, lower + offset, 1.0)
+    span = np.where(logarithmic, np.log((upper + offset) / base), upper - lower)
+    share = np.where(logarithmic, np.log((median + offset) / base), median - lower) / span
+
+    vector = StateVector(
+        names=names, free=chosen, lower=lower, upper=upper,
+        logarithmic=logarithmic, offset=offset,
+        shift=np.log(share / (1.0 - share)), slope=sd / (span * share * (1.0 - share)),
+        mean=np.zeros(len(chosen)), factor=np.eye(len(chosen)), held=median,
+    )  # fmt: skip
+    held = median.copy()
+    for name, value in fix.items():
+        held[names.index(name)] = float(value)
+    correlation = prior_correlation(names)
+    i = vector.index
+    k = np.array([names.index(name) for name in fix], dtype=int)
+    known_u = np.clip(_to_u(vector, held[k], k), -_U_LIMIT, _U_LIMIT)
+    # A normal conditioned on some of its elements (Rodgers 2000, appendix).
+    gain = np.linalg.solve(correlation[np.ix_(k, k)], correlation[np.ix_(k, i)]).T
+    covariance = correlation[np.ix_(i, i)] - gain @ correlation[np.ix_(k, i)]
+    return eqx.tree_at(
+        lambda v: (v.mean, v.factor, v.held),
+        vector,
+        (gain @ known_u, np.linalg.cholesky(covariance), held),
+    )
+
+
+def derived(
+    names: tuple[str, ...], parameters: Float[Array, "... P"]
+) -> dict[str, Float[Array, "..."]]:
+    """The quantities that follow from the parameters, as far as `names` suffice.
+
+    melanin_mg_per_mL
+        eumelanin and pheomelanin per volume of the living epidermis, mean over its three strata.
+    blood_percent
+        % volume of the dermis, mean by thickness.
+    oxygen_saturation
+        fraction.
+    water_percent
+        % volume of the dermis.
+    """
+    p = {name: parameters[..., i] for i, name in enumerate(names)}
+    quantities = {}
+    strata = ("melanosome_granulosum", "melanosome_spinosum", "melanosome_basale")
+    if {*strata, "colloidal_melanin", "eumelanin", "pheomelanin"} <= p.keys():
+        content = sum(
+            thickness * (p[stratum] + p["colloidal_melanin"])
+            for thickness, stratum in zip(EPIDERMIS_CM, strata, strict=True)
+        ) / sum(EPIDERMIS_CM)
+        quantities["melanin_mg_per_mL"] = content / 100.0 * (p["eumelanin"] + p["pheomelanin"])
+    if {"blood_papillary", "blood_reticular"} <= p.keys():
+        papillary, reticular = DERMIS_CM
+        quantities["blood_percent"] = (
+            papillary * p["blood_papillary"] + reticular * p["blood_reticular"]
+        ) / (papillary + reticular)
+    if "oxygen_saturation" in p:
+        quantities["oxygen_saturation"] = p["oxygen_saturation"]
+    if "water" in p:
+        quantities["water_percent"] = DERMIS_WATER_PERCENT * p["water"]
+    return quantities

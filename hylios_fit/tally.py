@@ -1,0 +1,104 @@
+"""`Paths` -> reflectance with its standard error, at any wavelengths and contents near by.
+
+One product and one exponential: the weight of a path is its density under the layers asked for over
+the mean of its densities under the layers that were walked.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hylios_fit.skin import Layers
+from hylios_fit.walker import ANGLE, HITS, Paths, log_density
+
+CHUNK = 2048  # rays at a time, so that memory does not depend on their number
+
+
+class Tally(NamedTuple):
+    """Sums over rays that entered the skin; w wavelengths."""
+
+    rays: Float[Array, ""]
+    weight: Float[Array, "w"]
+    weight2: Float[Array, "w"]
+
+    @property
+    def mean(self) -> Float[Array, "w"]:
+        """Share of the entered light that comes back out."""
+        return self.weight / self.rays
+
+    @property
+    def standard_error(self) -> Float[Array, "w"]:
+        """Standard error of `mean`, the rays taken as independent draws from their mixture."""
+        spread = jnp.maximum(self.weight2 / self.rays - self.mean**2, 0.0)
+        return jnp.sqrt(spread / jnp.maximum(self.rays - 1.0, 1.0))
+
+    @property
+    def effective_rays(self) -> Float[Array, "w"]:
+        """Effective number of the rays that came back: (sum w)^2 / sum w^2."""
+        return self.weight**2 / jnp.maximum(self.weight2, 1e-30)
+
+
+@partial(jax.jit, static_argnames=("own_only",))
+def collect(
+    paths: Paths, walked: Layers, asked: Layers, absorb: float = 1.0, own_only: bool = False
+) -> Tally:
+    """Sum the weights of `paths`, walked in the layers `walked`, for the layers `asked`.
+
+    Differentiable in `asked`; `walked` and `absorb` must be what `walker.walk` was given, with one
+    of its wavelengths for each hero. `own_only` shares no path among wavelengths, as it must be
+    where the refractive index depends on the wavelength: `asked` then has the same wavelengths.
+    """
+    from_walk = log_density(walked, absorb)
+    asked_for = log_density(asked)
+    # a common reference keeps the exponents small, so that float32 is enough
+    reference = jnp.mean(from_walk, axis=1, keepdims=True)
+    from_walk, asked_for = from_walk - reference, asked_for - reference
+    bends_walk, bends_asked = walked.theta_0 > 0, asked.theta_0 > 0
+    counts = jnp.zeros(from_walk.shape[1], from_walk.dtype).at[paths.hero].add(1.0)
+    log_share = jnp.log(counts / paths.hero.shape[0])
+    never = jnp.asarray(-1e30, from_walk.dtype)
+
+    def part(carry, chunk):
+        sums, escaped, hero = chunk
+        precise = jax.lax.Precision.HIGHEST
+        p = jnp.matmul(sums, from_walk, precision=precise) + log_share
+        q = jnp.matmul(sums, asked_for, precision=precise)
+        # a path that bent at a melanosome cannot come from a wavelength that does not bend, and
+        # one that did not bend where it hit cannot come from one that does
+        hit = jnp.sum(sums[:, HITS], axis=1) > 0
+        bent = sums[:, ANGLE] > 0
+        p = jnp.where(hit[:, None] & (bent[:, None] != bends_walk[None]), never, p)
+        q = jnp.where(hit[:, None] & (bent[:, None] != bends_asked[None]), never, q)
+        if own_only:
+            own = hero[:, None] == jnp.arange(p.shape[1])[None]
+            p = jnp.where(own, p, never)
+            q = jnp.where(own, q, never)
+        total = jax.nn.logsumexp(p, axis=1, keepdims=True)
+        weight = jnp.exp(q - total) * (escaped[:, None] > 0)
+        if own_only:
+            weight = jnp.where(own, weight, 0.0)
+        w, w2 = carry
+        return (w + jnp.sum(weight, axis=0), w2 + jnp.sum(weight**2, axis=0)), None
+
+    rays = paths.hero.shape[0]
+    size = min(CHUNK, rays)
+    padding = -rays % size
+    chunks = tuple(
+        jnp.pad(part_, [(0, padding)] + [(0, 0)] * (part_.ndim - 1)).reshape(
+            -1, size, *part_.shape[1:]
+        )
+        for part_ in paths
+    )
+    zero = jnp.zeros(asked_for.shape[1], asked_for.dtype)
+    (weight, weight2), _ = jax.lax.scan(part, (zero, zero), chunks)
+    return Tally(jnp.asarray(float(rays), zero.dtype), weight, weight2)
+
+
+def add(one: Tally | None, two: Tally) -> Tally:
+    """The sums of two lots of rays."""
+    return two if one is None else Tally(*(a + b for a, b in zip(one, two, strict=True)))
