@@ -192,11 +192,12 @@ def _job(
     noise_text, noise_of, follows = _noise_model(noise, spectra)
     models, error = [], {}
     for form in forms if usable.any() else ():
-        member = _model(surrogate, form, wavelength[usable])
-        offset = instrument.specular_offset(float(surrogate.at(form).surface), specular)
+        projected = surrogate.at(form).on(wavelength[usable])
+        member = as_float64(projected)
+        offset = instrument.specular_offset(float(projected.surface), specular)
         scan = np.asarray(_spectra(member, vector, jnp.asarray(states))) + offset
         models.append(Model(form, member, offset, scan))
-        error[form] = np.asarray(member.error_covariance, dtype=np.float64)
+        error[form] = np.asarray(projected.error_covariance, dtype=np.float64)
     settings = {
         "noise": noise_text,
         "free": list(vector.free),
@@ -251,10 +252,6 @@ def as_float64(tree: Any) -> Any:
         return leaf
 
     return jax.tree.map(cast, tree)
-
-
-def _model(surrogate: Any, form: str, wavelength_nm: np.ndarray) -> Any:
-    return as_float64(surrogate.at(form).on(wavelength_nm))
 
 
 def _scan_states(size: int, key: Array | None) -> np.ndarray:
@@ -524,7 +521,7 @@ def _s_hat(k: np.ndarray) -> np.ndarray:
 
 def _reduced_chi2(solution: _Solution, target: np.ndarray) -> tuple[float, bool]:
     """Chi-square for each degree of freedom, and whether it is significantly above 1."""
-    from scipy.stats import chi2
+    from scipy.special import chdtrc  # scipy.stats takes half a second to import
 
     used = np.isfinite(target)
     residual = solution.whitener @ np.where(used, solution.spectrum - target, 0.0)
@@ -533,7 +530,7 @@ def _reduced_chi2(solution: _Solution, target: np.ndarray) -> tuple[float, bool]
     # What the data give to the state is lost to the residual (Rodgers 2000, section 2.4).
     freedom = max(float(used.sum() - gained), 1.0)
     total = float(np.sum(residual**2))
-    return total / freedom, bool(chi2.sf(total, freedom) < SIGNIFICANCE and total > freedom)
+    return total / freedom, bool(chdtrc(freedom, total) < SIGNIFICANCE)
 
 
 def _fit_from(

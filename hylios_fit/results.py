@@ -299,7 +299,6 @@ def write_posteriors(posteriors: Sequence[Posterior], path: str | os.PathLike[st
 
     Raises `HyliosError` where they have not, where there is none, or where the folder is missing.
     """
-    import arviz
     import xarray
 
     path = Path(path)
@@ -321,7 +320,7 @@ def write_posteriors(posteriors: Sequence[Posterior], path: str | os.PathLike[st
         dim=xarray.Variable("spectrum", names),
         combine_attrs="drop",
     )
-    for name in joined.data_vars:
+    for name in map(str, joined.data_vars):
         joined[name].attrs["informed"] = [
             int(posterior.data.posterior[name].attrs.get("informed", 0)) for posterior in posteriors
         ]
@@ -332,7 +331,7 @@ def write_posteriors(posteriors: Sequence[Posterior], path: str | os.PathLike[st
     # A temporary file in the same folder: a rename is atomic only within one file system.
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        arviz.InferenceData(posterior=joined).to_netcdf(str(temporary), engine="h5netcdf")
+        _inference_data(joined).to_netcdf(str(temporary), engine="h5netcdf")
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -354,10 +353,16 @@ def read_posteriors(path: str | os.PathLike[str]) -> list[Posterior]:
             for name in one.data_vars:
                 informed = np.atleast_1d(one[name].attrs["informed"])
                 one[name].attrs = {"informed": int(informed[index])}
-            posteriors.append(Posterior(data=arviz.InferenceData(posterior=one), **record))
+            posteriors.append(Posterior(data=_inference_data(one), **record))
     except (OSError, KeyError, IndexError, AttributeError, TypeError, ValueError) as error:
         raise HyliosError(f"{path} is not a posterior.nc that can be read: {error}") from error
     return posteriors
+
+
+def _inference_data(posterior: Any) -> Any:
+    import arviz
+
+    return arviz.InferenceData(posterior=posterior)
 
 
 def _plain(value: Any) -> Any:

@@ -112,7 +112,7 @@ class Layers(NamedTuple):
     thickness: Float[Array, "6"]
     index: Float[Array, "6 w"]
     mu_a: Float[Array, "6 w"]
-    mu_particle: Float[Array, "6"]  # geometric attenuation of melanosomes or complexes, Eq. 3
+    mu_particle: Float[Array, "6 w"]  # geometric attenuation of melanosomes or complexes, Eq. 3
     hit_albedo: Float[Array, "6 w"]  # share of the light that survives one such hit
     theta_0: Float[Array, "w"]
     mu_fibre: Float[Array, "w"]  # papillary, once a pass, Eq. 7
@@ -238,6 +238,18 @@ def parse_setting(specimen: Specimen, setting: str) -> Specimen:
     return specimen.replace(**{name: value})
 
 
+def melanin_coefficient(
+    values: Mapping[str, Any], wavelength_nm: np.ndarray, dtype: Any = None
+) -> Float[Array, "w"]:
+    """Absorption coefficient inside the melanosomes in 1/cm."""
+    zeta = absorbers.specific_absorption(wavelength_nm)
+    eumelanin, pheomelanin = (
+        jnp.asarray(values[name], dtype) * jnp.asarray(zeta[name], dtype)
+        for name in ("eumelanin", "pheomelanin")
+    )
+    return eumelanin + pheomelanin
+
+
 def layers(
     values: Mapping[str, Any],
     form: str,
@@ -249,7 +261,7 @@ def layers(
     zeta = {k: jnp.asarray(v, dtype) for k, v in absorbers.specific_absorption(nm).items()}
     v = {name: jnp.asarray(value, dtype) for name, value in values.items()}
 
-    melanin = v["eumelanin"] * zeta["eumelanin"] + v["pheomelanin"] * zeta["pheomelanin"]
+    melanin = melanin_coefficient(v, nm, dtype)
     blood = (
         HAEMOGLOBIN_MG_PER_ML * v["oxygen_saturation"] * zeta["oxyhaemoglobin"]
         + HAEMOGLOBIN_MG_PER_ML * (1 - v["oxygen_saturation"]) * zeta["deoxyhaemoglobin"]
@@ -276,11 +288,11 @@ def layers(
         if layer in STRATA:
             scale = melanosome.SHRINKING[layer]
             per_content = melanosome.attenuation_per_content(form, scale)
-            mu_particle.append(v[f"melanosome_{layer}"] / 100 * per_content)
+            mu_particle.append(v[f"melanosome_{layer}"] / 100 * per_content * jnp.ones_like(melanin))
             albedo.append(melanosome.survival(form, scale, melanin, index[i]))
             own = own + v["colloidal_melanin"] / 100 * melanin
         else:
-            mu_particle.append(jnp.zeros((), dtype))
+            mu_particle.append(jnp.zeros_like(melanin))
             albedo.append(jnp.ones_like(melanin))
         if layer in ("papillary", "reticular"):
             own = own + v[f"blood_{layer}"] / 100 * blood
@@ -317,8 +329,8 @@ def optics_rows(
     for w, nm in enumerate(np.asarray(wavelength_nm, float)):
         for i, layer in enumerate(LAYERS):
             attenuator, mu_s, albedo, angle = "none", 0.0, 1.0, ""
-            if layer in STRATA and medium.mu_particle[i] > 0:
-                attenuator, mu_s = "melanosome", float(medium.mu_particle[i])
+            if layer in STRATA and medium.mu_particle[i, w] > 0:
+                attenuator, mu_s = "melanosome", float(medium.mu_particle[i, w])
                 albedo, angle = float(medium.hit_albedo[i, w]), f"{medium.theta_0[w]:.6g}"
             elif layer == "papillary" and medium.mu_fibre[w] > 0:
                 attenuator, mu_s = "fibre", float(medium.mu_fibre[w])

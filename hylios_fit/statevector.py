@@ -146,7 +146,7 @@ class StateVector(eqx.Module):
         whole = jnp.broadcast_to(held, (*free.shape[:-1], len(self.names)))
         return whole.at[..., self.index].set(free)
 
-    def state(self, parameters: Float[Array, "... P"]) -> np.ndarray:
+    def state(self, parameters: Float[Array | np.ndarray, "... P"]) -> np.ndarray:
         """The whitened state of given parameters; the held ones are not looked at.
 
         Raises `HyliosError` for a value at or beyond the edge of the box, where it is infinite.
@@ -162,7 +162,7 @@ class StateVector(eqx.Module):
         """(count, P) parameters drawn from the prior, float64."""
         z = np.asarray(jax.random.normal(key, (count, len(self.free))), dtype=np.float64)
         with jax.enable_x64(True):
-            return np.asarray(self.parameters(jnp.asarray(z)))
+            return np.array(self.parameters(jnp.asarray(z)))
 
     def edge_share(self, z: np.ndarray) -> np.ndarray:
         """(N,) where each free parameter lies in its range: 0 at the lower edge, 1 at the upper.
@@ -279,8 +279,8 @@ def state_vector(
 
 
 def derived(
-    names: tuple[str, ...], parameters: Float[Array, "... P"]
-) -> dict[str, Float[Array, "..."]]:
+    names: tuple[str, ...], parameters: Float[Array | np.ndarray, "... P"]
+) -> dict[str, Any]:
     """The quantities that follow from the parameters, as far as `names` suffice.
 
     melanin_mg_per_mL

@@ -34,8 +34,8 @@ PROPOSED = slice(9, 12)  # the same before rejections
 FIBRE, FIBRE_LENGTH, TISSUE, BOTTOM, ANGLE = range(12, 17)
 SUMS = 17
 
-LANES = 4096
-BATCH = 16_384  # rays of one compiled call; memory does not depend on the number of rays
+LANES = 8192
+BATCH = 65_536  # rays of one compiled call; memory does not depend on the number of rays
 
 
 class Paths(NamedTuple):
@@ -83,6 +83,9 @@ def _uniform(ray: Array, step: Array, stream: int, key: Array, dtype: Any) -> li
     return [(u.astype(dtype) + 0.5) * dtype.type(2.0**-32) for u in v]
 
 
+_stage = jax.lax.optimization_barrier  # without it XLA computes what several outputs share again
+
+
 class _Lane(NamedTuple):
     ray: Array
     depth: Array  # below the top of the layer
@@ -101,7 +104,7 @@ def _medium(layers: Layers, form: str, absorb: float) -> _Medium:
     dtype = layers.mu_a.dtype
     k = layers.mu_a.shape[1]
     one = jnp.ones((1, k), dtype)
-    event = layers.mu_particle[:, None] + layers.mu_tissue
+    event = layers.mu_particle + layers.mu_tissue
     event = event.at[4].set(layers.mu_fibre)
     if form == "dispersed":
         axes = melanosome.semi_axes(form)
@@ -154,8 +157,8 @@ def _collide(lane: _Lane, m: _Medium, hero: Array, step: Array, key: Array, inde
     """Move every lane that is inside a layer to its next event or interface."""
     dtype = lane.depth.dtype
     moving = lane.alive & ~lane.waiting
-    u1, u2, u3, u4 = _uniform(lane.ray, step, 0, key, dtype)
-    u5, u6, u7, u8 = _uniform(lane.ray, step, 1, key, dtype)
+    u1, u2, u3, u4 = _stage(_uniform(lane.ray, step, 0, key, dtype))
+    u5, u6, u7, u8 = _stage(_uniform(lane.ray, step, 1, key, dtype))
     layer = jnp.clip(lane.layer, 0, 5)
     papillary, reticular = layer == 4, layer == 5
     stratum = (layer >= 1) & (layer <= 3)
@@ -175,6 +178,9 @@ def _collide(lane: _Lane, m: _Medium, hero: Array, step: Array, key: Array, inde
     stops = moves & ~crosses
     absorbed = stops & (u2 * rate < absorb)
     meets = stops & ~absorbed
+    event, absorb, rate, thickness, crosses, distance, depth, absorbed, meets = _stage(
+        (event, absorb, rate, thickness, crosses, distance, depth, absorbed, meets)
+    )
 
     # the particle: orientation, where it is hit, whether it can be there (Eqs. 5 and 6)
     met = meets & stratum
@@ -186,7 +192,7 @@ def _collide(lane: _Lane, m: _Medium, hero: Array, step: Array, key: Array, inde
         )
         size = _pick(m.particle, layer - 1)
         a, b = m.axes[0], m.axes[1]
-        u9, u10, _, _ = _uniform(lane.ray, step, 2, key, dtype)
+        u9, u10, _, _ = _stage(_uniform(lane.ray, step, 2, key, dtype))
         spheroid = b > a
         side = jnp.where(spheroid, b, 2.0 * b)  # keeps the unused branch finite for spheres
         cos_axis = jnp.where(spheroid, melanosome.axis_cosine(a, side, u4), 1.0)
@@ -195,8 +201,11 @@ def _collide(lane: _Lane, m: _Medium, hero: Array, step: Array, key: Array, inde
         g_part, u_part, k_part = melanosome.entry_point(
             a, b, cos_axis, jnp.sqrt(u9), (jnp.cos(phi), jnp.sin(phi))
         )
-        p, q = fresnel.basis(lane.u)
+        p, q = _stage(fresnel.basis(lane.u))
         cb, sb = jnp.cos(beta), jnp.sin(beta)
+        g_part, u_part, k_part, cb, sb, sin_axis, cos_axis = _stage(
+            (g_part, u_part, k_part, cb, sb, sin_axis, cos_axis)
+        )
         g = tuple(cb * pi + sb * qi for pi, qi in zip(p, q, strict=True))
         k = tuple(cb * qi - sb * pi for pi, qi in zip(p, q, strict=True))
         cx, cy, cz = (
@@ -204,6 +213,7 @@ def _collide(lane: _Lane, m: _Medium, hero: Array, step: Array, key: Array, inde
             for gi, ui, ki in zip(g, lane.u, k, strict=True)
         )
         nx, ny, nz = (sin_axis * gi + cos_axis * ui for gi, ui in zip(g, lane.u, strict=True))
+        cx, cy, cz, nx, ny, nz, size = _stage((cx, cy, cz, nx, ny, nz, size))
         a2, b2 = (a * size) ** 2, (b * size) ** 2
         half = jnp.sqrt(_support2(a2, b2, nz))
         fits = (depth + cz >= half) & (depth + cz <= thickness - half)
@@ -214,7 +224,7 @@ def _collide(lane: _Lane, m: _Medium, hero: Array, step: Array, key: Array, inde
         ba2, bb2 = (a * bsize) ** 2, (b * bsize) ** 2
         theirs = jnp.sqrt(_support2(ba2, bb2, (dx * ex + dy * ey + dz * ez) * inv))
         apart = (bsize == 0) | (gap2 >= (own + theirs) ** 2)
-        hit = met & fits & apart
+        hit = _stage(met & fits & apart)
         before = tuple(
             jnp.where(hit, new, old)
             for new, old in zip(
@@ -225,13 +235,14 @@ def _collide(lane: _Lane, m: _Medium, hero: Array, step: Array, key: Array, inde
         hit = met
         u10 = u4
     absorbed = absorbed | (hit & (u3 >= _gather(m.albedo, layer, hero)))
-    hit = hit & ~absorbed
+    hit, absorbed = _stage((hit & ~absorbed, absorbed))
     fibre = meets & papillary
     tissue = meets & reticular
 
     # the new direction
     theta_0 = m.theta_0[hero]
     theta = scattering.exponential_proposal(theta_0, u7, u8)
+    theta = _stage(theta)
     cos_m, sin_m = jnp.cos(theta), jnp.sin(theta)
     bends = hit | drawn_again
     accepted = scattering.exponential_accepts(theta, sin_m, u10)
@@ -243,6 +254,9 @@ def _collide(lane: _Lane, m: _Medium, hero: Array, step: Array, key: Array, inde
     turns = (bends & accepted) | fibre | tissue
     # a hit has used up the other numbers, but what the test for absorption left of its own is free
     azimuth = 2.0 * jnp.pi * jnp.where(hit, _last(u2, absorb, rate), u5)
+    cos_new, sin_new, azimuth, turns, bends, accepted = _stage(
+        (cos_new, sin_new, azimuth, turns, bends, accepted)
+    )
     bent = _turn(lane.u, cos_new, sin_new, azimuth)
     u = tuple(jnp.where(turns, new, old) for new, old in zip(bent, lane.u, strict=True))
 
@@ -366,9 +380,13 @@ def _walk(
         def one(i, carry):
             step, lane = carry
             hero = heroes[jnp.clip(place, 0, rays - 1)]
-            for _ in range(substeps):
-                step = step + 1
-                lane = _collide(lane, medium, hero, step, key, independent)
+
+
+            def collide(_, carry):
+                step, lane = carry
+                return step + 1, _collide(lane, medium, hero, step + 1, key, independent)
+
+            step, lane = jax.lax.fori_loop(0, substeps, collide, (step, lane))
             return step, _cross(lane, medium, hero, step, key)
 
         step, lane = jax.lax.fori_loop(0, 8, one, (step, lane))
@@ -422,7 +440,7 @@ def walk(
     if heroes is None:
         heroes = (first + np.arange(rays)) % k
     # as many collisions between two looks at the interfaces as a crossing has, within reason
-    crossing = float(jnp.max(layers.mu_particle * layers.thickness))
+    crossing = float(jnp.mean(jnp.max(layers.mu_particle * layers.thickness[:, None], axis=0)))
     substeps = 1 if crossing < 2 else 4 if crossing < 15 else 12
     return _walk(
         medium,
@@ -449,17 +467,17 @@ def log_density(layers: Layers, absorb: float = 1.0) -> Float[Array, "17 w"]:
         return jnp.log(jnp.maximum(x, tiny))
 
     k = layers.mu_a.shape[1]
-    particle = layers.mu_particle[1:4, None]
+    particle = layers.mu_particle[1:4]
     bends = layers.theta_0 > 0
     theta_0 = jnp.where(bends, layers.theta_0, 1.0)
     norm = jnp.where(bends, scattering.exponential_log_norm(theta_0), 0.0)
-    exposure = absorb * layers.mu_a + layers.mu_particle[:, None] + layers.mu_tissue
+    exposure = absorb * layers.mu_a + layers.mu_particle + layers.mu_tissue
     row = jnp.ones((1, k), layers.mu_a.dtype)
     return jnp.concatenate(
         [
             -exposure,
             absorb * log(layers.hit_albedo[1:4]) - norm,
-            jnp.broadcast_to(log(particle), (3, k)),
+            log(particle),
             log(layers.mu_fibre)[None],
             -layers.mu_fibre[None],
             log(layers.mu_tissue[5:]),

@@ -44,11 +44,12 @@ class ToyMember(eqx.Module):
 
     @property
     def error_covariance(self):
-        distance = self.wavelength_nm[:, None] - self.wavelength_nm
+        distance = np.subtract.outer(*2 * (np.asarray(self.wavelength_nm),))
         return 0.003**2 * np.exp(-0.5 * (distance / 50.0) ** 2) + 1e-8 * np.eye(distance.shape[0])
 
     def __call__(self, parameters):
-        p = dict(zip(self.names, jnp.moveaxis(jnp.asarray(parameters), -1, 0)[..., None]))
+        columns = jnp.moveaxis(jnp.asarray(parameters), -1, 0)[..., None]
+        p = dict(zip(self.names, columns, strict=True))
         eumelanin, pheomelanin, oxy, deoxy, water, lipids = jnp.asarray(self.coefficients)
         pigment = (p["eumelanin"] * eumelanin + p["pheomelanin"] * pheomelanin) / 100.0
         depth = 0.0
