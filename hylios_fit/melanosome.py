@@ -165,7 +165,7 @@ def trace_inside(
     direction = jnp.stack([sin_axis, jnp.zeros_like(sin_axis), cos_axis])
 
     def step(state):
-        key, position, direction, inside, survived, path = state
+        key, position, direction, inside, _, path = state
         key, k_absorb, k_fresnel, k_bounce = jax.random.split(key, 4)
         length = chord(position, direction, a, b)
         reach = -jnp.log1p(-jax.random.uniform(k_absorb, dtype=dtype)) / mu_inside
@@ -176,9 +176,7 @@ def trace_inside(
         cos_i = jnp.clip(-jnp.dot(direction, inward), 0.0, 1.0)
         share = fresnel.reflectance(cos_i, index_ratio, jnp.ones_like(index_ratio))
         turned = inside & (jax.random.uniform(k_fresnel, dtype=dtype) < share)
-        direction = jnp.where(
-            turned, _bounce(k_bounce, direction, inward, turned), direction
-        )
+        direction = jnp.where(turned, _bounce(k_bounce, direction, inward, turned), direction)
         return key, position, direction, ~absorbed & turned, ~absorbed, path + length
 
     start = (key, position, direction, jnp.array(True), jnp.array(True), jnp.zeros((), dtype))

@@ -67,7 +67,9 @@ def rayleigh_cosine(xi_1: Array, xi_2: Array, xi_3: Array, xi_4: Array) -> Array
     has the density 3 x^2.
     """
     sign = jnp.where(xi_1 < 0.5, -1.0, 1.0).astype(xi_2.dtype)
-    magnitude = jnp.where(xi_4 < 0.75, xi_2, jnp.maximum(jnp.maximum(xi_2, xi_3), (xi_4 - 0.75) * 4))
+    magnitude = jnp.where(
+        xi_4 < 0.75, xi_2, jnp.maximum(jnp.maximum(xi_2, xi_3), (xi_4 - 0.75) * 4)
+    )
     return sign * magnitude
 
 

@@ -288,7 +288,9 @@ def layers(
         if layer in STRATA:
             scale = melanosome.SHRINKING[layer]
             per_content = melanosome.attenuation_per_content(form, scale)
-            mu_particle.append(v[f"melanosome_{layer}"] / 100 * per_content * jnp.ones_like(melanin))
+            mu_particle.append(
+                v[f"melanosome_{layer}"] / 100 * per_content * jnp.ones_like(melanin)
+            )
             albedo.append(melanosome.survival(form, scale, melanin, index[i]))
             own = own + v["colloidal_melanin"] / 100 * melanin
         else:
@@ -324,7 +326,7 @@ def optics_rows(
         "wavelength_nm,layer,thickness_cm,refractive_index,mu_a_per_cm,"
         "attenuator,mu_s_per_cm,albedo,mean_angle_rad"
     )
-    medium = Layers(*(np.asarray(part) for part in specimen.layers(wavelength_nm)))
+    medium = specimen.layers(wavelength_nm)
     rows: list[tuple[Any, ...]] = []
     for w, nm in enumerate(np.asarray(wavelength_nm, float)):
         for i, layer in enumerate(LAYERS):

@@ -121,9 +121,11 @@ def walk_rows(
     """Reflectance and its standard error, (rows, wavelengths) each, at 8 degrees of incidence."""
     count, w = len(parameters), len(WAVELENGTHS)
     medium = _coefficients(form)(jnp.asarray(parameters, jnp.float32))
-    ray = np.arange(count * rays)
-    own = (ray // count) % w  # rows in turn, so that long and short rays share the lanes
-    heroes = (ray % count) * w + own
+    # rows in turn, so that long and short rays share the lanes
+    bits = jax.random.bits(key, (count,), jnp.uint32)
+    theta_0 = medium.theta_0[0]
+    own = np.stack([walker.choose_heroes(theta_0, b[None], 0, rays) for b in bits], axis=1)
+    heroes = (own + w * np.arange(count)).reshape(-1)
     paths = walker.walk(
         _side_by_side(medium),
         form,
@@ -135,14 +137,13 @@ def walk_rows(
     )
     sums = paths.sums.reshape(rays, count, walker.SUMS)
     escaped = paths.escaped.reshape(rays, count)
-    hero = jnp.asarray(own.reshape(rays, count), jnp.int32)
+    node = paths.node.reshape(rays, count)
+    hero = jnp.asarray(own, jnp.int32)
     surface = surface_share(Specimen())
     reflectance, error = [], []
     for i in range(count):
         one = jax.tree.map(lambda a: a[i], medium)  # noqa: B023 (used at once)
-        found = tally.collect(
-            walker.Paths(sums[:, i], escaped[:, i], hero[:, i]), one, one, ABSORB
-        )
+        found = tally.collect(walker.Paths(sums[:, i], escaped[:, i], hero[:, i], node[:, i]), one, one, ABSORB)
         reflectance.append(surface + (1.0 - surface) * np.asarray(found.mean))
         error.append((1.0 - surface) * np.asarray(found.standard_error))
     return np.stack(reflectance), np.stack(error)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hylios_fit.skin import Layers
-from hylios_fit.walker import ANGLE, HITS, Paths, log_density
+from hylios_fit.walker import HITS, Paths, hero_shares, log_density, node_shares
 
 CHUNK = 2048  # rays at a time, so that memory does not depend on their number
 
@@ -58,22 +58,24 @@ def collect(
     # a common reference keeps the exponents small, so that float32 is enough
     reference = jnp.mean(from_walk, axis=1, keepdims=True)
     from_walk, asked_for = from_walk - reference, asked_for - reference
-    bends_walk, bends_asked = walked.theta_0 > 0, asked.theta_0 > 0
-    counts = jnp.zeros(from_walk.shape[1], from_walk.dtype).at[paths.hero].add(1.0)
-    log_share = jnp.log(counts / paths.hero.shape[0])
+    log_share = jnp.log(hero_shares(walked.theta_0))
     never = jnp.asarray(-1e30, from_walk.dtype)
 
+    def log_node(layers):
+        share = node_shares(layers.theta_0)
+        return jnp.where(share > 0, jnp.log(jnp.where(share > 0, share, 1.0)), never)
+
+    node_walk, node_asked = log_node(walked), log_node(asked)
+
     def part(carry, chunk):
-        sums, escaped, hero = chunk
+        sums, escaped, hero, node = chunk
         precise = jax.lax.Precision.HIGHEST
         p = jnp.matmul(sums, from_walk, precision=precise) + log_share
         q = jnp.matmul(sums, asked_for, precision=precise)
-        # a path that bent at a melanosome cannot come from a wavelength that does not bend, and
-        # one that did not bend where it hit cannot come from one that does
-        hit = jnp.sum(sums[:, HITS], axis=1) > 0
-        bent = sums[:, ANGLE] > 0
-        p = jnp.where(hit[:, None] & (bent[:, None] != bends_walk[None]), never, p)
-        q = jnp.where(hit[:, None] & (bent[:, None] != bends_asked[None]), never, q)
+        # the angle that a ray walked with matters only where it hit a melanosome
+        hit = jnp.sum(sums[:, HITS], axis=1)[:, None] > 0
+        p = p + jnp.where(hit, node_walk[node], 0.0)
+        q = q + jnp.where(hit, node_asked[node], 0.0)
         if own_only:
             own = hero[:, None] == jnp.arange(p.shape[1])[None]
             p = jnp.where(own, p, never)

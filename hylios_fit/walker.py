@@ -6,11 +6,14 @@ along it (path length in every layer, hits, fibre events, ...), so that the prob
 a path under any other wavelength or content is the exponential of one product, `log_density`.
 A ray that gets out therefore serves all wavelengths, weighted by its density there over the mean
 of its densities under all wavelengths that were walked (the balance heuristic, Veach and Guibas
-1995; hero wavelengths, Wilkie et al. 2014). No weight exceeds the number of wavelengths walked,
-nothing is cut, and no bias enters; `tally` does the sums.
+1995; hero wavelengths, Wilkie et al. 2014). The weights are bounded, and `tally` does the sums.
 
-Only the melanosome's inside is averaged: a hit costs its mean survival, tabulated from the literal
-trace, whatever the particle's orientation was.
+Two things differ from the letter of the paper (`analog`), both far below the errors met in use:
+- The inside of a melanosome is averaged: a hit costs its mean survival, tabulated from the literal
+  trace, whatever the particle's orientation was.
+- Where theta_0 falls from 5 degrees to 0 (780 to 1300 nm), a ray walks with one of the two angles
+  of `NODES` around it, drawn so that the mean of theta_0^2, which is what diffusion knows, is
+  right: paths that bend differently could not serve each other otherwise.
 """
 
 from __future__ import annotations
@@ -31,10 +34,13 @@ from hylios_fit.skin import LAYERS, STRATA, Layers
 LENGTH = slice(0, 6)  # path length in each layer, cm
 HITS = slice(6, 9)  # melanosomes or complexes hit in each stratum
 PROPOSED = slice(9, 12)  # the same before rejections
-FIBRE, FIBRE_LENGTH, TISSUE, BOTTOM, ANGLE = range(12, 17)
-SUMS = 17
+FIBRE, FIBRE_LENGTH, TISSUE, BOTTOM = range(12, 16)
+SUMS = 16
 
-LANES = 8192
+NODES = scattering.LATIMER_ANGLE * np.sqrt([0.0, 0.1, 0.3, 0.6, 1.0])
+ROUND = 16
+SUBSTEPS = 2
+LANES = 1024
 BATCH = 65_536  # rays of one compiled call; memory does not depend on the number of rays
 
 
@@ -42,12 +48,13 @@ class Paths(NamedTuple):
     """Rays that came back out, and how many set out.
 
     sums: what adds up along each path (`LENGTH`, `HITS`, ...); zero weight where `escaped` is 0.
-    hero: index of the wavelength that each ray walked for.
+    hero: index of the wavelength that each ray walked for; node: of its angle in `NODES`.
     """
 
-    sums: Float[Array, "ray 17"]
+    sums: Float[Array, "ray 16"]
     escaped: Float[Array, "ray"]
     hero: Int[Array, "ray"]
+    node: Int[Array, "ray"]
 
 
 class _Medium(NamedTuple):
@@ -58,7 +65,9 @@ class _Medium(NamedTuple):
     rate_event: Array  # (6, k): particles, fibres or tissue
     rate_absorb: Array  # (6, k)
     albedo: Array  # (6, k)
-    theta_0: Array  # (k,)
+    node: Array  # (k,): the lower of the two nodes, and the share of the upper one
+    node_part: Array
+    nodes: Array  # the angles
     particle: Array  # (3,): size of the particle relative to that in the basale
     axes: Array  # (2,): a, b in the basale (a sphere's radius twice)
     facets: Array
@@ -103,6 +112,8 @@ class _Lane(NamedTuple):
 def _medium(layers: Layers, form: str, absorb: float) -> _Medium:
     dtype = layers.mu_a.dtype
     k = layers.mu_a.shape[1]
+    shares = node_shares(layers.theta_0)
+    low = jnp.argmax(shares > 0, axis=0)
     one = jnp.ones((1, k), dtype)
     event = layers.mu_particle + layers.mu_tissue
     event = event.at[4].set(layers.mu_fibre)
@@ -116,7 +127,9 @@ def _medium(layers: Layers, form: str, absorb: float) -> _Medium:
         rate_event=event,
         rate_absorb=absorb * layers.mu_a,
         albedo=layers.hit_albedo**absorb,
-        theta_0=layers.theta_0,
+        node=low,
+        node_part=1.0 - jnp.take_along_axis(shares, low[None], axis=0)[0],
+        nodes=jnp.asarray(NODES, dtype),
         particle=jnp.asarray([melanosome.SHRINKING[s] for s in STRATA], dtype),
         axes=jnp.asarray(axes, dtype),
         facets=jnp.asarray(_facets(float(layers.roughness)), dtype),
@@ -153,7 +166,7 @@ def _support2(a2: Array, b2: Array, along: Array) -> Array:
     return a2 + (b2 - a2) * along**2
 
 
-def _collide(lane: _Lane, m: _Medium, hero: Array, step: Array, key: Array, independent: bool):
+def _collide(lane: _Lane, m: _Medium, hero: Array, theta_0: Array, step: Array, key: Array):
     """Move every lane that is inside a layer to its next event or interface."""
     dtype = lane.depth.dtype
     moving = lane.alive & ~lane.waiting
@@ -240,7 +253,6 @@ def _collide(lane: _Lane, m: _Medium, hero: Array, step: Array, key: Array, inde
     tissue = meets & reticular
 
     # the new direction
-    theta_0 = m.theta_0[hero]
     theta = scattering.exponential_proposal(theta_0, u7, u8)
     theta = _stage(theta)
     cos_m, sin_m = jnp.cos(theta), jnp.sin(theta)
@@ -272,7 +284,6 @@ def _collide(lane: _Lane, m: _Medium, hero: Array, step: Array, key: Array, inde
     add(FIBRE, fibre)
     add(FIBRE_LENGTH, papillary & ~lane.spent, distance)
     add(TISSUE, tissue)
-    add(ANGLE, bends & accepted, theta)
     return lane._replace(
         depth=depth,
         u=u,
@@ -372,6 +383,9 @@ def _walk(
     lanes: int,
 ) -> Paths:
     dtype = medium.thickness.dtype
+    number = first + jnp.arange(rays, dtype=jnp.uint32)
+    lot = _uniform(number, jnp.zeros((), jnp.uint32), 4, key, dtype)[0]
+    nodes = medium.node[heroes] + (lot < medium.node_part[heroes])
     fresh = partial(_start, incidence=incidence, dtype=dtype, independent=independent)
 
     def round_(state):
@@ -380,16 +394,17 @@ def _walk(
         def one(i, carry):
             step, lane = carry
             hero = heroes[jnp.clip(place, 0, rays - 1)]
+            theta_0 = medium.nodes[nodes[jnp.clip(place, 0, rays - 1)]]
 
 
             def collide(_, carry):
                 step, lane = carry
-                return step + 1, _collide(lane, medium, hero, step + 1, key, independent)
+                return step + 1, _collide(lane, medium, hero, theta_0, step + 1, key)
 
             step, lane = jax.lax.fori_loop(0, substeps, collide, (step, lane))
             return step, _cross(lane, medium, hero, step, key)
 
-        step, lane = jax.lax.fori_loop(0, 8, one, (step, lane))
+        step, lane = jax.lax.fori_loop(0, ROUND, one, (step, lane))
         ended = ~lane.alive & (place < rays)
         # out-of-range places are dropped: each ray is written once, when it ends
         target = jnp.where(ended, place, rays)
@@ -413,7 +428,7 @@ def _walk(
         jnp.asarray(lanes, jnp.int32),
     )
     state = jax.lax.while_loop(lambda s: jnp.any(s[1].alive & (s[2] < rays)), round_, state)
-    return Paths(state[3], state[4], heroes)
+    return Paths(state[3], state[4], heroes, nodes.astype(jnp.int32))
 
 
 def walk(
@@ -428,7 +443,7 @@ def walk(
     independent: bool = False,
     heroes: np.ndarray | None = None,
 ) -> Paths:
-    """Walk `rays` rays, number `first` and on, spread evenly over the layers' wavelengths.
+    """Walk `rays` rays, number `first` and on, spread over the layers' wavelengths.
 
     `absorb` is the share of the absorption that ends rays on the way (the rest is in the weights;
     the answer does not depend on it). `independent` leaves out the rejection of particles that
@@ -437,15 +452,16 @@ def walk(
     """
     medium = _medium(layers, form, absorb)
     k = layers.mu_a.shape[1]
+    bits = jax.random.bits(key, (2,), jnp.uint32)
     if heroes is None:
-        heroes = (first + np.arange(rays)) % k
+        heroes = choose_heroes(layers.theta_0, bits, first, rays)
     # as many collisions between two looks at the interfaces as a crossing has, within reason
     crossing = float(jnp.mean(jnp.max(layers.mu_particle * layers.thickness[:, None], axis=0)))
-    substeps = 1 if crossing < 2 else 4 if crossing < 15 else 12
+    substeps = SUBSTEPS
     return _walk(
         medium,
         jnp.asarray(heroes, jnp.int32),
-        jax.random.bits(key, (2,), jnp.uint32),
+        bits,
         jnp.asarray(first, jnp.uint32),
         jnp.asarray(incidence, layers.mu_a.dtype),
         rays,
@@ -455,11 +471,41 @@ def walk(
     )
 
 
-def log_density(layers: Layers, absorb: float = 1.0) -> Float[Array, "17 w"]:
+def node_shares(theta_0: Float[Array, "w"]) -> Float[Array, "node w"]:
+    """Probability of each of `NODES` at each wavelength; their mean of theta^2 is theta_0^2."""
+    nodes = jnp.asarray(NODES**2, theta_0.dtype)[:, None]
+    gaps = nodes[1:] - nodes[:-1]
+    square = theta_0[None] ** 2
+    up = jnp.clip((square - nodes[:-1]) / gaps, 0.0, 1.0)  # (node - 1, w)
+    edge = jnp.ones_like(square)
+    return jnp.concatenate([edge, up]) - jnp.concatenate([up, 0.0 * edge])
+
+
+def hero_shares(theta_0: Float[Array, "w"]) -> Float[Array, "w"]:
+    """Share of the rays that walk for each wavelength.
+
+    More where few wavelengths can serve each other (theta_0 falls), fewer in the infrared beyond,
+    where water leaves little light and little error.
+    """
+    falling = (theta_0 > 0) & (theta_0 < 0.999 * scattering.LATIMER_ANGLE)
+    weight = jnp.where(falling, 2.5, jnp.where(theta_0 > 0, 1.0, 0.35)).astype(theta_0.dtype)
+    return weight / jnp.sum(weight)
+
+
+def choose_heroes(theta_0: Array, bits: Array, first: int, rays: int) -> np.ndarray:
+    """Wavelength of each ray: a golden-ratio sequence from a random start, so that every ray's is
+    drawn from `hero_shares` and any number of them is well spread."""
+    start = float(bits[0]) / 2.0**32
+    place = (start + (first + np.arange(rays, dtype=np.float64)) * 0.6180339887498949) % 1.0
+    cumulative = np.cumsum(np.asarray(hero_shares(theta_0), np.float64))
+    return np.minimum(np.searchsorted(cumulative, place, side="right"), len(cumulative) - 1)
+
+
+def log_density(layers: Layers, absorb: float = 1.0) -> Float[Array, "16 w"]:
     """Coefficients of the sums along a path in the logarithm of its density at each wavelength.
 
     What does not depend on the wavelength or the contents (directions, facets, positions of
-    particles) is left out: only ratios of densities count.
+    particles) is left out: only ratios of densities count. The chance of a node is `node_shares`.
     """
     tiny = 1e-30
 
@@ -468,21 +514,17 @@ def log_density(layers: Layers, absorb: float = 1.0) -> Float[Array, "17 w"]:
 
     k = layers.mu_a.shape[1]
     particle = layers.mu_particle[1:4]
-    bends = layers.theta_0 > 0
-    theta_0 = jnp.where(bends, layers.theta_0, 1.0)
-    norm = jnp.where(bends, scattering.exponential_log_norm(theta_0), 0.0)
     exposure = absorb * layers.mu_a + layers.mu_particle + layers.mu_tissue
     row = jnp.ones((1, k), layers.mu_a.dtype)
     return jnp.concatenate(
         [
             -exposure,
-            absorb * log(layers.hit_albedo[1:4]) - norm,
+            absorb * log(layers.hit_albedo[1:4]),
             log(particle),
             log(layers.mu_fibre)[None],
             -layers.mu_fibre[None],
             log(layers.mu_tissue[5:]),
             (absorb * log(layers.bottom)) * row,
-            jnp.where(bends, -1.0 / theta_0, 0.0)[None],
         ]
     )
 

@@ -1,0 +1,196 @@
+"""A specimen's reflectance by any of the methods: `simulate` -> `Curve`."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import numpy as np
+
+from hylios_fit import analog, fresnel, skin, tally, walker
+from hylios_fit.errors import HyliosError
+from hylios_fit.skin import Specimen
+from hylios_fit.units import WAVELENGTH_MAX, WAVELENGTH_MIN
+
+METHODS = ("walker", "analog", "surrogate")
+MOST_RAYS = 20_000_000  # where a tolerance stops asking for more
+ANALOG_BATCH = 4096
+ABSORB = 0.5  # see `walker.walk`: the answer does not depend on it, the cost does
+
+
+@dataclasses.dataclass(frozen=True)
+class Curve:
+    """A directional-hemispherical reflectance curve, specular included.
+
+    All arrays have one value a wavelength: `reflectance` is `surface` (reflected at once) plus
+    `subsurface` (came back from inside), `standard_error` that of `reflectance`. `effective_rays`
+    counts what the weighted rays that came back are worth. `note` says what a reader must know.
+    """
+
+    wavelength_nm: np.ndarray
+    reflectance: np.ndarray
+    standard_error: np.ndarray
+    surface: np.ndarray
+    subsurface: np.ndarray
+    method: str
+    rays: int
+    effective_rays: np.ndarray
+    note: str = ""
+
+
+def simulate(
+    specimen: Specimen,
+    wavelengths: Any,
+    method: str = "walker",
+    *,
+    rays: int = 100_000,
+    key: jax.Array | None = None,
+    incidence: float = 8.0,
+    tolerance: float | None = None,
+    smooth_surface: bool = False,
+    independent_particles: bool = False,
+    progress: bool = False,
+) -> Curve:
+    """Reflectance of `specimen` at `wavelengths` (nm, 250 to 2500) for light at `incidence` degrees.
+
+    `walker` spreads `rays` over all wavelengths and shares their paths; `analog` sends `rays` rays
+    at each wavelength; `surrogate` asks the embedded one (8 degrees, its own training range).
+    With `tolerance`, rays are added until every standard error is below it, up to `MOST_RAYS`;
+    `note` says so if that was not enough. Both walks need a `key` (`jax.random.key(seed)`).
+    """
+    nm = np.atleast_1d(np.asarray(wavelengths, float))
+    _check(nm, method, rays, incidence, tolerance)
+    if smooth_surface:
+        specimen = specimen.replace(roughness=0.0)
+    if method == "surrogate":
+        return _surrogate(specimen, nm, incidence, independent_particles)
+    if key is None:
+        raise HyliosError(f"method {method!r} draws random numbers: give key=jax.random.key(seed)")
+    index = np.asarray(specimen.layers(nm).index)
+    angle = math.radians(incidence)
+    surface = np.array(
+        [fresnel.surface_reflectance(angle, 1.0, float(n), specimen.roughness) for n in index[0]]
+    )
+    run = _walked if method == "walker" else _traced
+    return run(
+        specimen, nm, surface, rays, key, angle, tolerance, independent_particles, progress
+    )
+
+
+def _check(
+    nm: np.ndarray, method: str, rays: int, incidence: float, tolerance: float | None
+) -> None:
+    if method not in METHODS:
+        raise HyliosError(f"method is one of {', '.join(METHODS)}, got {method!r}")
+    if nm.ndim != 1 or nm.size == 0:
+        raise HyliosError(f"wavelengths must be a list of numbers, got shape {nm.shape}")
+    outside = nm[~((nm >= WAVELENGTH_MIN) & (nm <= WAVELENGTH_MAX))]
+    if outside.size:
+        raise HyliosError(
+            f"wavelengths must lie in {WAVELENGTH_MIN:g} to {WAVELENGTH_MAX:g} nm, "
+            f"got {outside[0]:g}"
+        )
+    if not 1 <= rays < 2**32:
+        raise HyliosError(f"rays must lie in 1 to {2**32 - 1} (a 32-bit counter), got {rays}")
+    if not 0 <= incidence <= 85:
+        raise HyliosError(f"incidence must lie in 0 to 85 degrees, got {incidence:g}")
+    if tolerance is not None and not tolerance > 0:
+        raise HyliosError(f"tolerance is a standard error above 0, got {tolerance:g}")
+
+
+def _walked(specimen, nm, surface, rays, key, angle, tolerance, independent, progress) -> Curve:
+    medium = specimen.layers(nm)
+    # a refractive index that depends on the wavelength bends every path its own way
+    own_only = specimen.index_dispersion != 0
+    batch = min(walker.BATCH, rays) if tolerance is None else walker.BATCH
+    total = None
+    sent = 0
+    error = np.full(nm.shape, np.inf)
+    with _bar(rays if tolerance is None else None, progress) as bar:
+        while sent < rays if tolerance is None else np.max(error) > tolerance and sent < MOST_RAYS:
+            paths = walker.walk(
+                medium,
+                specimen.melanosome_form,
+                key,
+                incidence=angle,
+                first=sent,
+                rays=batch,
+                absorb=ABSORB,
+                independent=independent,
+            )
+            total = tally.add(
+                total, tally.collect(paths, medium, medium, ABSORB, own_only=own_only)
+            )
+            sent += batch
+            error = (1.0 - surface) * np.asarray(total.standard_error, float)
+            bar.update(batch)
+    assert total is not None
+    inside = (1.0 - surface) * np.asarray(total.mean, float)
+    return Curve(
+        nm, surface + inside, error, surface, inside, "walker", sent,
+        np.asarray(total.effective_rays, float), _short(error, tolerance, sent),
+    )  # fmt: skip
+
+
+def _traced(specimen, nm, surface, rays, key, angle, tolerance, independent, progress) -> Curve:
+    medium = specimen.layers(nm)
+    melanin = skin.melanin_coefficient(specimen.values, nm)
+    inside, at_once, sent = np.zeros(nm.shape), np.zeros(nm.shape), np.zeros(nm.shape, int)
+    batch = min(ANALOG_BATCH, rays)
+    with _bar(rays * len(nm) if tolerance is None else None, progress) as bar:
+        for i in range(len(nm)):
+            error = math.inf
+            while sent[i] < rays if tolerance is None else error > tolerance and sent[i] < 10**7:
+                now = batch if tolerance is not None else min(batch, rays - int(sent[i]))
+                part = jax.random.fold_in(jax.random.fold_in(key, i), int(sent[i]))
+                back, top = analog.trace(
+                    medium, melanin, specimen.melanosome_form, i, part, now,
+                    incidence=angle, independent=independent,
+                )  # fmt: skip
+                inside[i], at_once[i], sent[i] = inside[i] + back, at_once[i] + top, sent[i] + now
+                # one ray more of each kind keeps the error of a rare outcome above 0
+                p = (inside[i] + at_once[i] + 1.0) / (sent[i] + 2.0)
+                error = math.sqrt(p * (1.0 - p) / sent[i])
+                bar.update(now)
+    p = (inside + at_once + 1.0) / (sent + 2.0)
+    error = np.sqrt(p * (1.0 - p) / sent)
+    return Curve(
+        nm, (inside + at_once) / sent, error, at_once / sent, inside / sent, "analog",
+        int(sent.sum()), inside, _short(error, tolerance, int(sent.sum())),
+    )  # fmt: skip
+
+
+def _short(error: np.ndarray, tolerance: float | None, sent: int) -> str:
+    if tolerance is None or np.max(error) <= tolerance:
+        return ""
+    return (
+        f"the tolerance {tolerance:g} was not reached with {sent:,} rays: the largest standard "
+        f"error is {np.max(error):.2g}"
+    )
+
+
+def _bar(total: int | None, progress: bool) -> Any:
+    from tqdm import tqdm
+
+    return tqdm(total=total, unit="ray", unit_scale=True, disable=not progress, delay=2)
+
+
+def _surrogate(specimen: Specimen, nm: np.ndarray, incidence: float, independent: bool) -> Curve:
+    from hylios_fit.surrogate import load_surrogate
+
+    surrogate = load_surrogate()
+    if incidence != surrogate.incidence_deg or independent:
+        raise HyliosError(
+            f"the surrogate knows {surrogate.incidence_deg:g} degrees of incidence and particles "
+            "that reject each other only: use --method walker"
+        )
+    reflectance = surrogate.of(specimen, nm)
+    member = surrogate.at(specimen.melanosome_form).on(nm)
+    error = np.sqrt(np.diag(np.asarray(member.error_covariance)))
+    surface = np.full(nm.shape, float(member.surface))
+    return Curve(
+        nm, reflectance, error, surface, reflectance - surface, "surrogate", 0,
+        np.full(nm.shape, np.nan), "standard_error is the surrogate's held-out error",
+    )  # fmt: skip
