@@ -15,6 +15,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -326,7 +327,7 @@ def optics_rows(
         "wavelength_nm,layer,thickness_cm,refractive_index,mu_a_per_cm,"
         "attenuator,mu_s_per_cm,albedo,mean_angle_rad"
     )
-    medium = specimen.layers(wavelength_nm)
+    medium: Layers = jax.device_get(specimen.layers(wavelength_nm))
     rows: list[tuple[Any, ...]] = []
     for w, nm in enumerate(np.asarray(wavelength_nm, float)):
         for i, layer in enumerate(LAYERS):
