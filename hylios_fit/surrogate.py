@@ -333,9 +333,9 @@ def check_report(surrogate: Surrogate) -> str:
     about = surrogate.about
     member = surrogate.at(surrogate.forms[0])
     lines = [
-        f"surrogate of {about['rows']} rows ({about['generator']}, {about['rays_per_row']} rays "
-        f"each), hylios_fit {about['hylios_fit']}, seed {about['seed']}",
-        f"held out: {about['held_out_rows']} specimens of {about['held_out_rays']} rays each",
+        f"surrogate of {about['rows']} rows ({about['generator']}, {about['rays']} rays for every "
+        f"{about['rows_sharing_paths']}), hylios_fit {about['hylios_fit']}, seed {about['seed']}",
+        f"held out: {about['held_out_rows']} of them",
         "",
         "trained on:",
     ]

@@ -1,4 +1,8 @@
-"""The training table: a design over the pigmentation parameters, walked row by row.
+"""The training table: a design over the pigmentation parameters, walked in groups of rows.
+
+Absorption changes no path, only its weight. So `SHARE` rows with the same melanosome contents, and
+everything else their own, are served by one set of paths, walked for the least absorbing mixture
+among them; their Monte Carlo errors are therefore not independent of each other.
 
 A table is a Zarr group that xarray opens: `reflectance` and `standard_error` over (row,
 wavelength_nm), `design` over (row, parameter). It is made whole at once, filled chunk by chunk, and
@@ -29,9 +33,10 @@ if TYPE_CHECKING:
 
 FORMAT = "hylios_fit table"
 FORMAT_VERSION = 1
-ROWS = 4096
-RAYS_PER_ROW = 16_384
-CHUNK = 16  # rows of one melanosome form that walk together
+ROWS = 16_384
+RAYS = 8192  # of each set of paths
+SHARE = 8  # rows that one set of paths serves
+GROUPS = 8  # sets of paths of one melanosome form that walk together
 ABSORB = 0.5  # share of the absorption that ends rays on the way (the rest is in the weights)
 INCIDENCE_DEG = 8.0
 WAVELENGTHS = np.arange(250.0, 2500.1, 5.0)
@@ -66,16 +71,26 @@ DESIGN = (
 NAMES = tuple(axis.name for axis in DESIGN)
 
 
+PATH_AXES = 3  # the first axes of the design: what changes paths, the same within a group
+
+
 def design(rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Parameters (rows, P) and melanosome form (rows,; index into FORMS) of the design.
 
-    A scrambled Sobol sequence, one point for each form in turn, so that the first rows of a larger
-    table are those of a smaller one.
+    Scrambled Sobol sequences, one group of `SHARE` rows for each form in turn, so that the first
+    rows of a larger table are those of a smaller one.
     """
     from scipy.stats import qmc
 
-    points = qmc.Sobol(len(DESIGN), rng=np.random.default_rng(seed))
-    unit = points.random(1 << max(1, int(np.ceil(np.log2(max(2, -(-rows // 2)))))))
+    groups = -(-rows // (SHARE * len(FORMS)))
+
+    def sobol(dimensions: int, count: int, stream: int) -> np.ndarray:
+        generator = np.random.default_rng([seed, stream])
+        points = qmc.Sobol(dimensions, rng=generator)
+        return points.random(1 << int(np.ceil(np.log2(max(count, 2)))))[:count]
+
+    paths = np.repeat(sobol(PATH_AXES, groups, 0), SHARE, axis=0)
+    unit = np.hstack([paths, sobol(len(DESIGN) - PATH_AXES, groups * SHARE, 1)])
     columns = []
     for u, axis in zip(unit.T, DESIGN, strict=True):
         if axis.spread == "log":
@@ -83,8 +98,10 @@ def design(rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         else:
             power = {"linear": 1, "square": 2, "cube": 3}[axis.spread]
             columns.append(axis.lower + (axis.upper - axis.lower) * u**power)
-    both = np.repeat(np.stack(columns, axis=1), len(FORMS), axis=0)
-    return both[:rows], (np.arange(len(both)) % len(FORMS))[:rows]
+    grouped = np.stack(columns, axis=1).reshape(groups, 1, SHARE, -1)
+    both = np.repeat(grouped, len(FORMS), axis=1).reshape(groups * len(FORMS) * SHARE, -1)
+    form = np.arange(len(both)) // SHARE % len(FORMS)
+    return both[:rows], form[:rows]
 
 
 @lru_cache(maxsize=4)
@@ -116,37 +133,52 @@ def _side_by_side(medium: Layers) -> Layers:
 
 
 def walk_rows(
-    parameters: np.ndarray, form: str, key: jax.Array, rays: int = RAYS_PER_ROW
+    parameters: np.ndarray, form: str, key: jax.Array, rays: int = RAYS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Reflectance and its standard error, (rows, wavelengths) each, at 8 degrees of incidence."""
-    count, w = len(parameters), len(WAVELENGTHS)
-    medium = _coefficients(form)(jnp.asarray(parameters, jnp.float32))
-    # rows in turn, so that long and short rays share the lanes
+    """Reflectance and its standard error, (rows, wavelengths) each, at 8 degrees of incidence.
+
+    `parameters` (rows, P) in the order of `NAMES`; every `SHARE` rows in turn have the same
+    melanosome contents and share `rays` rays.
+    """
+    w = len(WAVELENGTHS)
+    groups = parameters.reshape(-1, SHARE, parameters.shape[-1])
+    if not (groups[..., :PATH_AXES] == groups[:, :1, :PATH_AXES]).all():
+        raise HyliosError(f"each {SHARE} rows must have the same melanosome contents")
+    count = len(groups)
+    least = groups.min(axis=1)
+    saturation = NAMES.index("oxygen_saturation")
+    least[:, saturation] = groups[..., saturation].mean(axis=1)
+    coefficients = _coefficients(form)
+    walked = coefficients(jnp.asarray(least, jnp.float32))
+    asked = coefficients(jnp.asarray(parameters, jnp.float32))
+    # groups in turn, so that long and short rays share the lanes
     bits = jax.random.bits(key, (count,), jnp.uint32)
-    theta_0 = medium.theta_0[0]
+    theta_0 = walked.theta_0[0]
     own = np.stack([walker.choose_heroes(theta_0, b[None], 0, rays) for b in bits], axis=1)
-    heroes = (own + w * np.arange(count)).reshape(-1)
     paths = walker.walk(
-        _side_by_side(medium),
+        _side_by_side(walked),
         form,
         key,
         incidence=np.radians(INCIDENCE_DEG),
         rays=count * rays,
         absorb=ABSORB,
-        heroes=heroes,
+        heroes=(own + w * np.arange(count)).reshape(-1),
     )
-    sums = paths.sums.reshape(rays, count, walker.SUMS)
-    escaped = paths.escaped.reshape(rays, count)
-    node = paths.node.reshape(rays, count)
-    hero = jnp.asarray(own, jnp.int32)
     surface = surface_share(Specimen())
-    reflectance, error = [], []
-    for i in range(count):
-        one = jax.tree.map(lambda a: a[i], medium)  # noqa: B023 (used at once)
-        found = tally.collect(walker.Paths(sums[:, i], escaped[:, i], hero[:, i], node[:, i]), one, one, ABSORB)
-        reflectance.append(surface + (1.0 - surface) * np.asarray(found.mean))
-        error.append((1.0 - surface) * np.asarray(found.standard_error))
-    return np.stack(reflectance), np.stack(error)
+    reflectance, error = np.empty((2, len(parameters), w))
+    for g in range(count):
+        mine = walker.Paths(
+            paths.sums.reshape(rays, count, -1)[:, g],
+            paths.escaped.reshape(rays, count)[:, g],
+            jnp.asarray(own[:, g], jnp.int32),
+            paths.node.reshape(rays, count)[:, g],
+        )
+        base = Layers(*(part[g] for part in walked))
+        for row in range(g * SHARE, (g + 1) * SHARE):
+            found = tally.collect(mine, base, Layers(*(part[row] for part in asked)), ABSORB)
+            reflectance[row] = surface + (1.0 - surface) * np.asarray(found.mean)
+            error[row] = (1.0 - surface) * np.asarray(found.standard_error)
+    return reflectance, error
 
 
 def surface_share(specimen: Specimen) -> float:
@@ -186,7 +218,8 @@ def _empty(rows: int, seed: int, rays: int) -> xarray.Dataset:
             "format_version": FORMAT_VERSION,
             "hylios_fit": __version__,
             "seed": seed,
-            "rays_per_row": rays,
+            "rays": rays,
+            "rows_sharing_paths": SHARE,
             "generator": "walker",
             "surface": surface_share(Specimen()),
             "incidence_deg": INCIDENCE_DEG,
@@ -225,7 +258,7 @@ def generate(
     rows: int = ROWS,
     seed: int = 0,
     resume: bool = False,
-    rays: int = RAYS_PER_ROW,
+    rays: int = RAYS,
     progress: bool = True,
     threads: int = 2,
 ) -> Path:
@@ -234,18 +267,19 @@ def generate(
     from tqdm import tqdm
 
     path = Path(path)
-    if rows < 2 * CHUNK:
-        raise HyliosError(f"a table has at least {2 * CHUNK} rows, asked for {rows}")
+    chunk_rows = len(FORMS) * GROUPS * SHARE
+    if rows < chunk_rows or rows % chunk_rows:
+        raise HyliosError(f"a table has a multiple of {chunk_rows} rows, asked for {rows}")
     if path.exists() and not resume:
         raise HyliosError(f"{path} exists; add --resume to go on with it, or choose another name")
     if path.exists():
-        _same(open_table(path).attrs, path, seed=seed, rays_per_row=rays)
+        _same(open_table(path).attrs, path, seed=seed, rays=rays)
         stored = open_table(path).sizes["row"]
         if stored != rows:
             raise HyliosError(f"{path} has {stored} rows, asked for {rows}")
     else:
         new = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
-        chunks = (2 * CHUNK, len(WAVELENGTHS))
+        chunks = (chunk_rows, len(WAVELENGTHS))
         encoding = {name: {"chunks": chunks} for name in ("reflectance", "standard_error")}
         try:
             _empty(rows, seed, rays).to_zarr(
@@ -258,12 +292,12 @@ def generate(
     store: Any = zarr.open_group(path, mode="r+")
     parameters, form = design(rows, seed)
     done = np.isfinite(store["standard_error"][:, 0])
-    starts = [s for s in range(0, rows, 2 * CHUNK) if not done[s : s + 2 * CHUNK].all()]
+    starts = [s for s in range(0, rows, chunk_rows) if not done[s : s + chunk_rows].all()]
     key = jax.random.key(seed)
 
     def chunk(start: int) -> tuple[int, np.ndarray, np.ndarray]:
-        part = slice(start, min(start + 2 * CHUNK, rows))
-        shape = (part.stop - part.start, len(WAVELENGTHS))
+        part = slice(start, start + chunk_rows)
+        shape = (chunk_rows, len(WAVELENGTHS))
         reflectance, error = np.empty(shape), np.empty(shape)
         for i, name in enumerate(FORMS):
             mine = form[part] == i

@@ -11,7 +11,7 @@ import numpy as np
 from hylios_fit import surrogate as surrogate_module
 from hylios_fit.errors import HyliosError
 from hylios_fit.surrogate import FLOOR, features
-from hylios_fit.table import open_table
+from hylios_fit.table import PATH_AXES, open_table
 
 COMPONENTS = 12
 HIDDEN = (48, 48)
@@ -27,7 +27,7 @@ def train(
 ) -> str:
     """Train on the table and write the surrogate; returns the report that `check` prints.
 
-    An eighth of the rows of each form is never seen in training and measures the error.
+    An eighth of the sets of paths of each form is never seen in training and measures the error.
     """
     from tqdm import tqdm
 
@@ -59,7 +59,10 @@ def train(
             )
         x = np.asarray(features(names, jnp.asarray(table["design"].values[mine], jnp.float32)))
         share = np.clip((reflectance[mine] - surface) / (1.0 - surface), 0.0, None)
-        test = np.random.default_rng(seed).permutation(len(x)) < HELD_OUT * len(x)
+        # whole sets of paths are held out: rows that share paths share their noise
+        _, group = np.unique(table["design"].values[mine][:, :PATH_AXES], axis=0, return_inverse=True)
+        drawn = np.random.default_rng(seed).permutation(group.max() + 1)
+        test = drawn[group] < HELD_OUT * (group.max() + 1)
         held_out_rows += int(test.sum())
         fitted = _fit(x[~test], np.log(share[~test] + FLOOR), seed)
         log = _predict(fitted, x[test])
@@ -76,12 +79,12 @@ def train(
         "incidence_deg": float(table.attrs["incidence_deg"]),
         "generator": table.attrs["generator"],
         "rows": int(done.sum()),
-        "rays_per_row": int(table.attrs["rays_per_row"]),
+        "rays": int(table.attrs["rays"]),
+        "rows_sharing_paths": int(table.attrs["rows_sharing_paths"]),
         "table_seed": int(table.attrs["seed"]),
         "seed": seed,
         "depth": len(HIDDEN) + 1,
         "held_out_rows": held_out_rows,
-        "held_out_rays": int(table.attrs["rays_per_row"]),
     }
     path = surrogate_module.save(out_path, arrays, about)
     return surrogate_module.check_report(surrogate_module.load_surrogate(path))
