@@ -220,14 +220,16 @@ def survival(
     """
     a, _ = semi_axes(form)
     ratios, lengths, weights = _paths()["dark" if form == "dispersed" else "light"]
-    ratio = jnp.clip(MELANIN_INDEX / index_around, ratios[0], ratios[-1])
-    step = ratios[1] - ratios[0]
-    low = jnp.clip(jnp.floor((ratio - ratios[0]) / step), 0, len(ratios) - 2).astype(int)
-    part = ((ratio - ratios[0]) / step - low)[:, None]
+    last = len(ratios) - 1
+    first, step = float(ratios[0]), float(ratios[1] - ratios[0])
+    place = jnp.clip((MELANIN_INDEX / index_around - first) / step, 0.0, last)
+    low = jnp.minimum(jnp.floor(place), last - 1.0)
+    part = (place - low)[:, None]
     table = jnp.asarray(weights, mu_inside.dtype)
-    weight = (1.0 - part) * table[low] + part * table[low + 1]
+    row = low.astype(int)
+    weight = (1.0 - part) * table[row] + part * table[row + 1]
     path = jnp.asarray(lengths, mu_inside.dtype) * (a * scale)
-    one = jnp.sum(weight * jnp.exp(-mu_inside[:, None] * path), axis=-1)
+    one = jnp.sum(weight * jnp.exp(-mu_inside[:, None] * path[None]), axis=-1)
     chances = met_distribution(form)
     total = jnp.zeros_like(one)
     for chance in reversed(chances):  # Horner's rule

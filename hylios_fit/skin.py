@@ -178,8 +178,8 @@ class Specimen:
             raise HyliosError(f"cannot read the specimen file {path}: {error.strerror}") from error
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise HyliosError(f"{path} is not a TOML file of parameters: {error}") from error
-        start = cls.preset(str(table.pop("preset", "S3")))
         try:
+            start = cls.preset(str(table.pop("preset", "S3")))
             return dataclasses.replace(start.replace(**table), name=path.stem)
         except HyliosError as error:
             raise HyliosError(f"{path}: {error}") from error

@@ -38,8 +38,8 @@ FIBRE, FIBRE_LENGTH, TISSUE, BOTTOM = range(12, 16)
 SUMS = 16
 
 NODES = scattering.LATIMER_ANGLE * np.sqrt([0.0, 0.1, 0.3, 0.6, 1.0])
-ROUND = 16
-SUBSTEPS = 2
+ROUND = 16  # looks at the interfaces between two exchanges of rays that ended
+SUBSTEPS = 2  # collisions between two looks at the interfaces
 LANES = 1024
 BATCH = 65_536  # rays of one compiled call; memory does not depend on the number of rays
 
@@ -88,7 +88,9 @@ def _uniform(ray: Array, step: Array, stream: int, key: Array, dtype: Any) -> li
         if not last:
             v = [u ^ (u >> 16) for u in v]
     if dtype == jnp.float32:
-        return [((u >> 8).astype(dtype) + 0.5) * dtype.type(2.0**-24) for u in v]
+        below_one = dtype.type(1.0 - 2.0**-24)  # which the largest would be rounded to
+        v = [((u >> 8).astype(dtype) + 0.5) * dtype.type(2.0**-24) for u in v]
+        return [jnp.minimum(u, below_one) for u in v]
     return [(u.astype(dtype) + 0.5) * dtype.type(2.0**-32) for u in v]
 
 
@@ -315,7 +317,7 @@ def _cross(lane: _Lane, m: _Medium, hero: Array, step: Array, key: Array) -> _La
     bottom = beyond == 6
     place = u1 * (m.facets.shape[0] - 1)
     low = jnp.floor(place).astype(jnp.int32)
-    part = place - low
+    part = place - low.astype(dtype)
     cos_s = (1.0 - part) * m.facets[low] + part * m.facets[low + 1]
     cos_s = jnp.where(surface, cos_s, 1.0)
     sin_s = jnp.sqrt(jnp.clip(1.0 - cos_s**2, 0.0, 1.0))
@@ -385,7 +387,8 @@ def _walk(
     dtype = medium.thickness.dtype
     number = first + jnp.arange(rays, dtype=jnp.uint32)
     lot = _uniform(number, jnp.zeros((), jnp.uint32), 4, key, dtype)[0]
-    nodes = medium.node[heroes] + (lot < medium.node_part[heroes])
+    upper = (lot < medium.node_part[heroes]).astype(medium.node.dtype)
+    nodes = medium.node[heroes] + upper
     fresh = partial(_start, incidence=incidence, dtype=dtype, independent=independent)
 
     def round_(state):
@@ -455,9 +458,6 @@ def walk(
     bits = jax.random.bits(key, (2,), jnp.uint32)
     if heroes is None:
         heroes = choose_heroes(layers.theta_0, bits, first, rays)
-    # as many collisions between two looks at the interfaces as a crossing has, within reason
-    crossing = float(jnp.mean(jnp.max(layers.mu_particle * layers.thickness[:, None], axis=0)))
-    substeps = SUBSTEPS
     return _walk(
         medium,
         jnp.asarray(heroes, jnp.int32),
@@ -466,7 +466,7 @@ def walk(
         jnp.asarray(incidence, layers.mu_a.dtype),
         rays,
         independent,
-        substeps,
+        SUBSTEPS,
         min(LANES, rays),
     )
 

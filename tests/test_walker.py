@@ -1,0 +1,451 @@
+"""The fast walk and its sums: laws, honesty of its errors, and the two slow witnesses."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from scipy import stats
+
+from hylios_fit import analog, fresnel, scattering, skin, tally, walker
+from hylios_fit.skin import Specimen
+
+NM = np.array([300.0, 420.0, 550.0, 1450.0])
+FALLING = np.array([550.0, 900.0, 1100.0, 1450.0])  # theta_0 falls in the middle
+RAYS = 8192  # one shape for all walks, so that they share one compiled program
+S3 = Specimen.preset("S3")
+
+
+def walk(layers, key, form="complex", rays=RAYS, **options):
+    return walker.walk(layers, form, key, rays=rays, **options)
+
+
+def within(one, two, errors=4.0):
+    """Two tallies agree at every wavelength within their combined standard errors."""
+    spread = np.hypot(np.asarray(one.standard_error), np.asarray(two.standard_error))
+    assert np.all(spread > 0)
+    z = np.abs(np.asarray(one.mean) - np.asarray(two.mean)) / spread
+    assert np.all(z < errors), (one.mean, two.mean, z)
+
+
+@pytest.fixture(scope="module")
+def layers():
+    return S3.layers(NM)
+
+
+@pytest.fixture(scope="module")
+def paths(layers):
+    return walk(layers, jax.random.key(1))
+
+
+@pytest.fixture(scope="module")
+def found(paths, layers):
+    return tally.collect(paths, layers, layers)
+
+
+# --- random numbers ------------------------------------------------------------------------------
+
+
+def numbers(first=0, step=0, stream=0, key=(1, 2), count=1 << 16, dtype=jnp.float32):
+    ray = jnp.arange(count, dtype=jnp.uint32) + jnp.uint32(first)
+    key = jnp.asarray(key, jnp.uint32)
+    return [
+        np.asarray(x, float)
+        for x in walker._uniform(ray, jnp.uint32(step), stream, key, jnp.dtype(dtype))
+    ]
+
+
+def independent(x, y, bins=16):
+    """p-value that two lots of numbers are uniform and independent."""
+    counts, _, _ = np.histogram2d(x, y, bins, [[0, 1], [0, 1]])
+    return stats.chisquare(counts.ravel()).pvalue
+
+
+def test_the_numbers_are_uniform(dtype):
+    for stream in range(5):
+        for x in numbers(step=3, stream=stream, dtype=dtype):
+            counts, _ = np.histogram(x, 256, (0, 1))
+            assert stats.chisquare(counts).pvalue > 1e-4
+
+
+def test_the_numbers_are_independent():
+    base = numbers()
+    others = {
+        "each other": [base[(i + 1) % 4] for i in range(4)],
+        "the next ray": numbers(first=1),
+        "the next step": numbers(step=1),
+        "the next stream": numbers(stream=1),
+        "another key": numbers(key=(1, 3)),
+        "keys swapped": numbers(key=(2, 1)),
+        "a batch later": numbers(first=walker.BATCH),
+    }
+    for name, other in others.items():
+        for i in range(4):
+            assert independent(base[i], other[i]) > 1e-5, name
+            assert abs(np.corrcoef(base[i], other[i])[0, 1]) < 5 / math.sqrt(base[i].size), name
+
+
+def test_steps_of_one_ray_are_independent():
+    step = jnp.arange(1 << 16, dtype=jnp.uint32)
+    ray = jnp.full(step.shape, 7, jnp.uint32)
+    x = np.asarray(
+        walker._uniform(ray, step, 0, jnp.asarray([1, 2], jnp.uint32), jnp.dtype("float32"))
+    )
+    for i in range(4):
+        assert independent(x[i, ::2], x[i, 1::2]) > 1e-5
+
+
+def test_the_numbers_stay_inside_the_unit_interval():
+    @jax.jit
+    def ends(ray):
+        key = jnp.asarray([1, 2], jnp.uint32)
+        x = walker._uniform(ray, jnp.uint32(0), 0, key, jnp.dtype("float32"))
+        return jnp.stack([jnp.min(jnp.stack(x)), jnp.max(jnp.stack(x))])
+
+    for start in range(0, 1 << 24, 1 << 22):
+        low, high = np.asarray(ends(jnp.arange(start, start + (1 << 22), dtype=jnp.uint32)))
+        assert 0.0 < low < 1e-6
+        assert 1.0 - 1e-6 < high < 1.0
+
+
+# --- laws ----------------------------------------------------------------------------------------
+
+
+def without_absorption(layers):
+    return layers._replace(
+        mu_a=jnp.zeros_like(layers.mu_a), hit_albedo=jnp.ones_like(layers.hit_albedo)
+    )
+
+
+def test_without_absorption_all_light_returns(layers):
+    clear = without_absorption(layers)
+    paths = walk(clear, jax.random.key(2))
+    assert np.all(np.asarray(paths.escaped) == 1.0)
+    assert np.asarray(paths.sums)[:, walker.HITS].sum() > RAYS
+    shared = tally.collect(paths, clear, clear)
+    z = (np.asarray(shared.mean) - 1.0) / np.asarray(shared.standard_error)
+    assert np.all(np.abs(z) < 4)
+    # the plain count: the rays of each wavelength over their share
+    own = np.asarray(tally.collect(paths, clear, clear, own_only=True).mean)
+    share = np.bincount(np.asarray(paths.hero), minlength=len(NM)) / RAYS
+    np.testing.assert_allclose(
+        own, share / np.asarray(walker.hero_shares(clear.theta_0)), rtol=1e-5
+    )
+    np.testing.assert_allclose(own, 1.0, atol=2e-3)
+
+
+def test_scattering_changes_nothing_where_nothing_absorbs(layers):
+    clear = without_absorption(layers)
+    clear = clear._replace(mu_tissue=clear.mu_tissue.at[5].set(50.0))
+    paths = walk(clear, jax.random.key(3))
+    assert np.all(np.asarray(paths.escaped) == 1.0)
+    assert np.asarray(paths.sums)[:, walker.TISSUE].sum() > RAYS
+
+
+def stack_return(layers, column, incidence):
+    """Share of the light entering smooth layers without scatterers over a black bottom that
+    comes back, by adding incoherent interfaces from below."""
+    index = np.asarray(layers.index, float)[:, column]
+    mu_a = np.asarray(layers.mu_a, float)[:, column]
+    angle = np.arcsin(math.sin(incidence) / index)
+    passed = np.exp(-mu_a * np.asarray(layers.thickness, float) / np.cos(angle))
+    below = 0.0  # what a ray that goes down at the top of a layer sends back up there
+    for i in range(5, -1, -1):
+        if i == 5:
+            under = 0.0
+        else:
+            r = reference.fresnel(angle[i], index[i], index[i + 1])
+            under = r + (1 - r) ** 2 * below / (1 - r * below)
+        below = passed[i] ** 2 * under
+    top = reference.fresnel(angle[0], index[0], 1.0)
+    return below * (1 - top) / (1 - top * below)
+
+
+def test_layers_without_scatterers_are_a_stack_of_plates(layers):
+    none = jnp.zeros_like(layers.mu_particle)
+    index = jnp.asarray([1.1, 1.9, 1.9, 1.9, 1.1, 1.9], jnp.float32)[:, None]
+    plates = layers._replace(
+        mu_particle=none,
+        mu_fibre=jnp.zeros_like(layers.mu_fibre),
+        mu_a=jnp.asarray([[5.0, 10.0, 20.0, 40.0]] * 6, jnp.float32),
+        index=jnp.broadcast_to(index, none.shape),
+        bottom=jnp.zeros_like(layers.bottom),
+        roughness=jnp.zeros_like(layers.roughness),
+    )
+    for incidence in (math.radians(8), 1.2):
+        found = tally.collect(walk(plates, jax.random.key(4), incidence=incidence), plates, plates)
+        expected = np.array([stack_return(plates, i, incidence) for i in range(len(NM))])
+        assert expected.min() > 0.05
+        z = (np.asarray(found.mean) - expected) / np.asarray(found.standard_error)
+        assert np.all(np.abs(z) < 4), (found.mean, expected)
+
+
+def test_a_black_bottom_and_no_scatterers_leave_the_interfaces_alone(layers):
+    bare = layers._replace(
+        mu_particle=jnp.zeros_like(layers.mu_particle),
+        mu_fibre=jnp.zeros_like(layers.mu_fibre),
+        mu_a=jnp.zeros_like(layers.mu_a),
+        bottom=jnp.zeros_like(layers.bottom),
+    )
+    paths = walk(bare, jax.random.key(5))
+    assert np.all(np.asarray(paths.sums)[np.asarray(paths.escaped) == 1, walker.BOTTOM] == 0)
+    share = np.asarray(paths.escaped).mean()
+    expected = stack_return(bare, 0, math.radians(8))  # roughness moves it little
+    assert abs(share - expected) < 4 * math.sqrt(expected / RAYS)
+
+
+def test_a_thicker_lossy_layer_returns_less_and_a_brighter_bottom_more(found, paths, layers):
+    more = tally.collect(paths, layers, S3.replace(blood_papillary=0.6).layers(NM))
+    dim = tally.collect(paths, layers, S3.replace(bottom_reflectance=0.7).layers(NM))
+    assert np.all(np.asarray(more.mean)[1:3] < np.asarray(found.mean)[1:3])
+    assert np.all(np.asarray(dim.mean)[1:3] < np.asarray(found.mean)[1:3])
+
+
+def test_the_sums_of_paths_are_possible(paths, layers):
+    out = np.asarray(paths.sums)[np.asarray(paths.escaped) == 1]
+    length, hits, proposed = (out[:, s] for s in (walker.LENGTH, walker.HITS, walker.PROPOSED))
+    assert len(out) > 100
+    assert np.all(length >= 0)
+    assert np.all(length[:, 0] >= 2 * 0.001 / 1.001)  # in and out through the corneum
+    assert np.all(hits <= proposed)
+    assert (hits < proposed).any()  # some particles are refused
+    assert np.all(hits[:, :2] == 0)  # S3 has none above the basale
+    assert np.all(out[:, walker.FIBRE_LENGTH] <= length[:, 4] * 1.0001)
+    deep = out[:, walker.BOTTOM] > 0
+    assert np.all(length[deep, 5] >= 0.19)
+    assert np.all(out[~deep, walker.BOTTOM] == 0)
+
+
+# --- sharing, absorbing, repeating ---------------------------------------------------------------
+
+
+def test_shared_paths_agree_with_each_wavelengths_own(paths, layers, found):
+    own = tally.collect(paths, layers, layers, own_only=True)
+    within(found, own)
+    assert np.all(np.asarray(found.standard_error) < 1.05 * np.asarray(own.standard_error))
+    assert np.all(np.asarray(found.effective_rays) > np.asarray(own.effective_rays) * 0.9)
+
+
+def test_other_company_leaves_a_wavelength_the_same(found):
+    other = np.array([300.0, 480.0, 550.0, 1700.0])
+    layers = S3.layers(other)
+    two = tally.collect(walk(layers, jax.random.key(6)), layers, layers)
+    common = np.array([0, 2])
+    part = [tally.Tally(t.rays, t.weight[common], t.weight2[common]) for t in (found, two)]
+    within(*part)
+
+
+def test_where_the_angle_falls_shared_paths_agree_with_own(layers):
+    falling = S3.layers(FALLING)
+    paths = walk(falling, jax.random.key(7))
+    within(
+        tally.collect(paths, falling, falling),
+        tally.collect(paths, falling, falling, own_only=True),
+    )
+    nodes = np.asarray(paths.node)
+    theta2 = walker.NODES**2
+    for i, theta_0 in enumerate(np.asarray(falling.theta_0, float)):
+        mine = nodes[np.asarray(paths.hero) == i]
+        mean = theta2[mine].mean()
+        spread = theta2[mine].std() / math.sqrt(mine.size)
+        assert abs(mean - theta_0**2) < 4 * spread + 1e-6 * theta2[-1]
+        assert set(mine) <= {0, 1, 2, 3, 4}
+
+
+def test_node_shares_keep_the_mean_square_of_the_angle(dtype):
+    theta_0 = jnp.asarray(scattering.melanosome_angle(np.linspace(700, 1400, 50)), dtype)
+    shares = np.asarray(walker.node_shares(theta_0), float)
+    np.testing.assert_allclose(shares.sum(axis=0), 1.0, atol=1e-5)
+    assert shares.min() >= -1e-6
+    np.testing.assert_allclose(
+        walker.NODES**2 @ shares, np.asarray(theta_0) ** 2, atol=1e-6 * walker.NODES[-1] ** 2 + 1e-9
+    )
+
+
+def test_heroes_are_spread_as_stated():
+    theta_0 = S3.layers(FALLING).theta_0
+    shares = np.asarray(walker.hero_shares(theta_0))
+    assert shares.sum() == pytest.approx(1.0)
+    bits = jax.random.bits(jax.random.key(8), (2,), jnp.uint32)
+    for first, rays in ((0, 1000), (1000, 1000)):
+        heroes = walker.choose_heroes(theta_0, bits, first, rays)
+        found = np.bincount(heroes, minlength=4) / rays
+        np.testing.assert_allclose(found, shares, atol=5e-3)
+
+
+@pytest.mark.parametrize("absorb", [0.5, 0.1])
+def test_where_absorption_is_counted_changes_nothing(absorb, found, layers):
+    paths = walk(layers, jax.random.key(9), absorb=absorb)
+    two = tally.collect(paths, layers, layers, absorb)
+    within(found, two)
+    assert np.asarray(paths.escaped).sum() > 1.2 * RAYS * float(np.mean(found.mean))
+
+
+def test_the_error_falls_as_the_square_root_of_the_rays(found, layers):
+    total = found
+    for i in range(1, 8):
+        paths = walk(layers, jax.random.key(1), first=i * RAYS)
+        total = tally.add(total, tally.collect(paths, layers, layers))
+    assert float(total.rays) == 8 * RAYS
+    ratio = np.asarray(found.standard_error) / np.asarray(total.standard_error)
+    np.testing.assert_allclose(ratio, math.sqrt(8), rtol=0.25)
+    within(found, total)
+
+
+def test_the_same_key_gives_the_same_paths(paths, layers):
+    again = walk(layers, jax.random.key(1))
+    for one, two in zip(paths, again, strict=True):
+        np.testing.assert_array_equal(one, two)
+    other = walk(layers, jax.random.key(10))
+    assert not np.array_equal(paths.sums, other.sums)
+    later = walk(layers, jax.random.key(1), first=RAYS)
+    assert not np.array_equal(paths.sums, later.sums)
+
+
+def test_both_precisions_agree(found):
+    with jax.enable_x64(True):
+        layers = S3.layers(NM, jnp.float64)
+        double = tally.collect(walk(layers, jax.random.key(11)), layers, layers)
+        assert double.mean.dtype == jnp.float64
+    within(found, double)
+
+
+def test_weights_in_single_precision_are_those_in_double(paths, layers, found):
+    with jax.enable_x64(True):
+        wide = walker.Paths(
+            jnp.asarray(np.asarray(paths.sums), jnp.float64),
+            jnp.asarray(np.asarray(paths.escaped), jnp.float64),
+            jnp.asarray(np.asarray(paths.hero)),
+            jnp.asarray(np.asarray(paths.node)),
+        )
+        layers = S3.layers(NM, jnp.float64)
+        double = tally.collect(wide, layers, layers)
+    np.testing.assert_allclose(found.mean, double.mean, rtol=2e-3)
+
+
+# --- other contents from the same paths ----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"blood_papillary": 0.45, "blood_reticular": 0.2},
+        {"eumelanin": 40.0},
+        {"melanosome_basale": 3.15},
+        {"water": 0.8, "oxygen_saturation": 0.3},
+    ],
+)
+def test_reweighting_agrees_with_a_fresh_walk(changes, paths, layers, found):
+    asked = S3.replace(**changes).layers(NM)
+    moved = tally.collect(paths, layers, asked)
+    fresh = tally.collect(walk(asked, jax.random.key(12)), asked, asked)
+    within(moved, fresh)
+    assert np.abs(np.asarray(moved.mean) / np.asarray(found.mean) - 1).max() > 2e-3
+
+
+@pytest.mark.parametrize("name", ["blood_papillary", "melanosome_basale", "bottom_reflectance"])
+def test_gradients_are_those_of_the_same_paths(name, paths):
+    with jax.enable_x64(True):
+        wide = walker.Paths(
+            jnp.asarray(np.asarray(paths.sums), jnp.float64),
+            jnp.asarray(np.asarray(paths.escaped), jnp.float64),
+            jnp.asarray(np.asarray(paths.hero)),
+            jnp.asarray(np.asarray(paths.node)),
+        )
+        start = S3.replace(bottom_reflectance=0.9)
+        walked = start.layers(NM, jnp.float64)
+
+        def mean(value):
+            asked = skin.layers({**start.values, name: value}, "complex", NM, jnp.float64)
+            return tally.collect(wide, walked, asked).mean
+
+        here = start.values[name]
+        slope = jax.jacfwd(mean)(jnp.asarray(here))
+        total = jax.grad(lambda v: jnp.sum(mean(v)))(jnp.asarray(here))
+        h = 1e-4 * here
+        finite = (mean(jnp.asarray(here + h)) - mean(jnp.asarray(here - h))) / (2 * h)
+        np.testing.assert_allclose(slope, finite, rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(total, jnp.sum(finite), rtol=1e-5)
+        assert np.abs(slope).max() > 1e-4
+
+
+def test_the_standard_errors_are_honest(paths, layers):
+    lots = 32
+    size = RAYS // lots
+    means, errors = [], []
+    for i in range(lots):
+        part = walker.Paths(*(x[i * size : (i + 1) * size] for x in paths))
+        one = tally.collect(part, layers, layers)
+        means.append(np.asarray(one.mean, float))
+        errors.append(np.asarray(one.standard_error, float))
+    means, errors = np.array(means), np.array(errors)
+    # the spread of the lots over the error that they state, pooled so that it is well known
+    ratio = means.var(axis=0, ddof=1) / (errors**2).mean(axis=0)
+    high = stats.chi2.ppf(1 - 1e-4, lots - 1) / (lots - 1)
+    low = stats.chi2.ppf(1e-4, lots - 1) / (lots - 1)
+    # wavelengths take turns, which makes the spread a little smaller than stated, never larger
+    assert np.all(ratio < high), ratio
+    assert np.all(ratio > 0.7 * low), ratio
+
+
+# --- the slow witnesses --------------------------------------------------------------------------
+
+
+def test_the_walk_agrees_with_a_literal_one_without_melanosomes():
+    specimen = S3.replace(melanosome_basale=0, colloidal_melanin=0.5, roughness=0.3)
+    layers = specimen.layers(NM)
+    found = tally.collect(walk(layers, jax.random.key(13)), layers, layers)
+    rng = np.random.default_rng(6)
+    surface = fresnel.surface_reflectance(math.radians(8), 1.0, 1.55, 0.3)
+    rays = 2000
+    for i in (1, 2):
+        arguments = (
+            np.asarray(layers.thickness, float),
+            np.asarray(layers.index, float)[:, i],
+            np.asarray(layers.mu_a, float)[:, i],
+            float(layers.mu_fibre[i]),
+        )
+        fates = [
+            reference.skin_walk(rng, *arguments, 1.0, 0.3, math.radians(8)) for _ in range(rays)
+        ]
+        share = fates.count("out") / rays
+        mean, error = float(found.mean[i]), float(found.standard_error[i])
+        spread = math.hypot((1 - surface) * error, math.sqrt(share * (1 - share) / rays))
+        assert 0.05 < share < 0.95
+        assert abs(share - (1 - surface) * mean) < 4 * spread
+        top = fates.count("top") / rays
+        assert abs(top - surface) < 4 * math.sqrt(surface * (1 - surface) / rays)
+
+
+@pytest.mark.parametrize(("preset", "alone"), [("S3", False), ("S1", True)])
+def test_the_walk_agrees_with_the_paper_to_the_letter(preset, alone):
+    specimen = Specimen.preset(preset)
+    layers = specimen.layers(NM)
+    melanin = skin.melanin_coefficient(specimen.values, NM)
+    paths = walk(layers, jax.random.key(14), independent=alone)
+    found = tally.collect(paths, layers, layers)
+    surface = fresnel.surface_reflectance(math.radians(8), 1.0, 1.55, specimen.roughness)
+    rays = 1024
+    total = 0.0
+    for i in range(len(NM)):
+        inside, top = analog.trace(
+            layers, melanin, "complex", i, jax.random.key(15), rays, independent=alone
+        )
+        expected = (1 - surface) * float(found.mean[i])
+        error = (1 - surface) * float(found.standard_error[i])
+        variance = expected * (1 - expected) / rays + error**2
+        total += (inside / rays - expected) ** 2 / variance
+        assert abs(top / rays - surface) < 4 * math.sqrt(surface * (1 - surface) / rays)
+    assert stats.chi2.sf(total, len(NM)) > 1e-4
+
+
+def test_the_literal_walk_returns_all_light_that_nothing_absorbs():
+    clear = without_absorption(S3.layers(NM))
+    none = jnp.zeros(len(NM), jnp.float32)
+    inside, top = analog.trace(clear, none, "complex", 1, jax.random.key(16), 256)
+    assert inside + top == 256
+    inside, top = analog.trace(clear, none, "complex", 1, jax.random.key(16), 256)
+    again = analog.trace(clear, none, "complex", 1, jax.random.key(16), 256)
+    assert (inside, top) == again
