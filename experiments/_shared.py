@@ -123,6 +123,16 @@ def tidy(axes: Any, x: str, y: str, title: str = "") -> None:
         axes.spines[side].set_visible(False)
 
 
+def logarithmic(axis: Any) -> None:
+    """A log scale with plain numbers at 1, 2 and 5 of each decade."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    getattr(axis.axes, f"set_{axis.axis_name}scale")("log")
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
 def save_figure(made: Any, path: Any) -> None:
     made.savefig(path, dpi=110, metadata={"Software": None})
 

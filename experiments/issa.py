@@ -235,7 +235,8 @@ def draw(result: dict[str, Any], path: Any) -> None:
         density["ita_edges"], density["melanin_edges"], np.ma.masked_equal(counts, 0),
         cmap="Greys", norm=LogNorm(vmin=0.6, vmax=max(counts.max(), 2.0)),
     )  # fmt: skip
-    figure.colorbar(shown, ax=cloud, label="spectra in a cell", pad=0.01)
+    scale = figure.colorbar(shown, ax=cloud, label="spectra in a cell", pad=0.01)
+    _shared.logarithmic(scale.ax.yaxis)
     for i, (name, group) in enumerate(result["groups"].items()):
         if not group["fitted"]:
             continue
@@ -243,7 +244,7 @@ def draw(result: dict[str, Any], path: Any) -> None:
             group["ita_median"], group["melanin"]["median"], "o", ms=9, mec="white",
             color=_shared.COLOURS[i % len(_shared.COLOURS)], label=name,
         )  # fmt: skip
-    cloud.set_yscale("log")
+    _shared.logarithmic(cloud.yaxis)
     cloud.legend(fontsize=7.5, title="median of the group", title_fontsize=8)
     rank = result["spearman_melanin_ita"]
     low, high = rank["interval_95"]
@@ -262,10 +263,10 @@ def draw(result: dict[str, Any], path: Any) -> None:
         boxes.plot(spread["median"], y, "o", color="white", mec=colour, ms=5)
     boxes.set_yticks(range(len(rows)), [f"{name} ({found['fitted']:,})" for name, found, _ in rows],
                      fontsize=8)  # fmt: skip
-    boxes.set_xscale("log")
+    _shared.logarithmic(boxes.xaxis)
     boxes.invert_yaxis()
     _shared.tidy(
-        boxes, "melanin (mg/mL): median, 50 % and 90 % of spectra", "",
-        "by group and by site, darkest first",
+        boxes, "melanin (mg/mL of epidermis)", "",
+        "median, 50 % and 90 % by group and by site, darkest first",
     )  # fmt: skip
     _shared.save_figure(figure, path)

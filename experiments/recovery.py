@@ -347,13 +347,13 @@ def draw(result: dict[str, Any], path: Any) -> None:
             ends = [np.nanmin([truth, value]), np.nanmax([truth, value])]
             panel.plot(ends, ends, color="black", lw=0.8)
             if quantity in ("melanin_mg_per_mL", "blood_percent"):
-                panel.set_xscale("log")
-                panel.set_yscale("log")
+                _shared.logarithmic(panel.xaxis)
+                _shared.logarithmic(panel.yaxis)
             panel.legend(fontsize=7)
             part = covered[quantity]["informed"]
             told = "none informed"
             if part["n"]:
-                told = f"68 % interval holds {100 * part['share_68']:.0f} % of informed"
+                told = f"{part['in_68']} of {part['n']} informed held"
             label = LABELS[quantity]
             _shared.tidy(
                 panel, f"true {label}", f"estimated {label}", f"{name} nm: {told}"

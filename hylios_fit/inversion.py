@@ -207,6 +207,9 @@ def _job(
         "starts": starts,
         "key": None if key is None else np.asarray(key_data(key)).tolist(),
         "versions": versions(),
+        "surrogate": str(getattr(surrogate, "about", {}).get("sha256", "")),
+        "source": spectra.source,
+        "notes": list(spectra.notes),
     }
     return _Job(tuple(models), vector, usable, states, noise_of, follows, error, starts, settings)
 

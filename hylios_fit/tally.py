@@ -70,7 +70,7 @@ def collect(
     def part(carry, chunk):
         sums, escaped, hero, node = chunk
         precise = jax.lax.Precision.HIGHEST
-        p = jnp.matmul(sums, from_walk, precision=precise) + log_share
+        p = jnp.matmul(sums, from_walk, precision=precise) + log_share[None]
         q = jnp.matmul(sums, asked_for, precision=precise)
         # the angle that a ray walked with matters only where it hit a melanosome
         hit = jnp.sum(sums[:, HITS], axis=1)[:, None] > 0
@@ -81,7 +81,8 @@ def collect(
             p = jnp.where(own, p, never)
             q = jnp.where(own, q, never)
         total = jax.nn.logsumexp(p, axis=1, keepdims=True)
-        weight = jnp.exp(q - total) * (escaped[:, None] > 0)
+        # inside the exponential, so that gradients of rays that ended within stay finite
+        weight = jnp.exp(jnp.where(escaped[:, None] > 0, q - total, never))
         if own_only:
             weight = jnp.where(own, weight, 0.0)
         w, w2 = carry

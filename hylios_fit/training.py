@@ -16,7 +16,7 @@ from hylios_fit.table import PATH_AXES, open_table
 COMPONENTS = 12
 HIDDEN = (48, 48)
 ENSEMBLE = 4
-PENALTY = 0.1
+PENALTY = 0.03
 HELD_OUT = 0.12
 LEAST_ROWS = 64  # of each form
 MODES = 12

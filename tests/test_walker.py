@@ -442,10 +442,8 @@ def test_the_walk_agrees_with_the_paper_to_the_letter(preset, alone):
 
 
 def test_the_literal_walk_returns_all_light_that_nothing_absorbs():
-    clear = without_absorption(S3.layers(NM))
+    clear = without_absorption(S3.replace(melanosome_basale=0.3).layers(NM))
     none = jnp.zeros(len(NM), jnp.float32)
-    inside, top = analog.trace(clear, none, "complex", 1, jax.random.key(16), 256)
-    assert inside + top == 256
-    inside, top = analog.trace(clear, none, "complex", 1, jax.random.key(16), 256)
-    again = analog.trace(clear, none, "complex", 1, jax.random.key(16), 256)
-    assert (inside, top) == again
+    inside, top = analog.trace(clear, none, "complex", 1, jax.random.key(16), 64)
+    assert inside + top == 64
+    assert inside > 50
