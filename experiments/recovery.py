@@ -325,8 +325,8 @@ LABELS = {
 
 def draw(result: dict[str, Any], path: Any) -> None:
     """Estimates with their intervals over the truth, for both ranges."""
-    figure = _shared.figure(13.0, 6.8)
-    panels = figure.subplots(2, 4)
+    figure = _shared.figure(13.0, 3.4 * len(result["shown"]))
+    panels = figure.subplots(len(result["shown"]), len(QUANTITIES), squeeze=False)
     for row, (name, points) in zip(panels, result["shown"].items(), strict=True):
         covered = result["cases"][f"{SHOWN} {name}"]["quantities"]
         for panel, quantity in zip(row, QUANTITIES, strict=True):
@@ -355,7 +355,5 @@ def draw(result: dict[str, Any], path: Any) -> None:
             if part["n"]:
                 told = f"{part['in_68']} of {part['n']} informed held"
             label = LABELS[quantity]
-            _shared.tidy(
-                panel, f"true {label}", f"estimated {label}", f"{name} nm: {told}"
-            )
+            _shared.tidy(panel, f"true {label}", f"estimated {label}", f"{name} nm: {told}")
     _shared.save_figure(figure, path)

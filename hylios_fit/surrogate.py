@@ -103,6 +103,10 @@ class Member(eqx.Module):
         bands = (1.0 - part) * spectrum[..., self.low] + part * spectrum[..., self.high]
         return jnp.where(inside, bands, jnp.nan)
 
+    # arrays have no hash, and jax.jit wants one of what it compiles
+    __hash__ = object.__hash__
+    __eq__ = object.__eq__
+
     @property
     def error_covariance(self) -> np.ndarray:
         """Covariance (B, B) of the surrogate's own error in reflectance, from held-out specimens."""
@@ -154,6 +158,9 @@ class Surrogate(eqx.Module):
 
     members: dict[str, Member]
     about: dict[str, Any] = eqx.field(static=True)
+
+    __hash__ = object.__hash__
+    __eq__ = object.__eq__
 
     @property
     def forms(self) -> tuple[str, ...]:
@@ -266,7 +273,8 @@ def load_surrogate(path: str | Path | None = None) -> Surrogate:
 @lru_cache(maxsize=4)
 def _load_cached(path: Path, stamp: tuple[int, int]) -> Surrogate:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # from memory: numpy leaves a damaged file open
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         about = json.loads(arrays.pop("about").tobytes())
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:

@@ -208,8 +208,9 @@ def _empty(rows: int, seed: int, rays: int) -> xarray.Dataset:
         },
         {
             "wavelength_nm": ("wavelength_nm", WAVELENGTHS, {"units": "nm"}),
-            "parameter": ("parameter", np.array(NAMES)),
-            "unit": ("parameter", np.array([SPECS[name].unit for name in NAMES])),
+            # variable-length strings: those of fixed length have no stable form in Zarr
+            "parameter": ("parameter", np.array(NAMES, dtype=object)),
+            "unit": ("parameter", np.array([SPECS[name].unit for name in NAMES], dtype=object)),
             "lower": ("parameter", np.array([axis.lower for axis in DESIGN])),
             "upper": ("parameter", np.array([axis.upper for axis in DESIGN])),
         },

@@ -413,12 +413,12 @@ def _walk(
         target = jnp.where(ended, place, rays)
         sums = sums.at[target].set(jnp.stack(lane.sums, axis=1), mode="drop")
         escaped = escaped.at[target].set(lane.escaped.astype(dtype), mode="drop")
-        order = upcoming + jnp.cumsum(ended) - 1
+        order = upcoming + jnp.cumsum(ended, dtype=jnp.int32) - 1
         place = jnp.where(ended, order, place).astype(jnp.int32)
         begins = ended & (place < rays)
         new = fresh(first + place.astype(jnp.uint32))
         lane = jax.tree.map(lambda n, o: jnp.where(begins, n, o), new, lane)
-        return step, lane, place, sums, escaped, upcoming + jnp.sum(ended)
+        return step, lane, place, sums, escaped, upcoming + jnp.sum(ended, dtype=jnp.int32)
 
     place = jnp.arange(lanes, dtype=jnp.int32)
     lane = fresh(first + place.astype(jnp.uint32))
