@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
@@ -38,17 +39,21 @@ BANDS_NM: Mapping[str, tuple[float, float]] = {
 """Ranges of the summaries: from the first wavelength to below the second, the last to its end."""
 
 
+@functools.cache  # as it was when the run began, whatever is edited meanwhile
+def _syntax(module: str) -> bytes:
+    """A module's syntax tree, so that comments and line breaks do not count."""
+    source = Path(str(hylios_fit.__file__)).with_name(f"{module}.py")
+    return ast.dump(ast.parse(source.read_text(encoding="utf-8"))).encode()
+
+
 def checkpoint(name: str, modules: Iterable[str], **settings: Any) -> Path:
     """A folder for the parts of a long run, one for each set of settings and code.
 
     Parts that were written by another version of the `modules` of hylios_fit are not found again.
     """
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
-    package = Path(str(hylios_fit.__file__)).parent
     for module in sorted(modules):
-        source = (package / f"{module}.py").read_text(encoding="utf-8")
-        # the syntax tree, so that comments and line breaks do not count
-        digest.update(ast.dump(ast.parse(source)).encode())
+        digest.update(_syntax(module))
     folder = CACHE / name / digest.hexdigest()[:16]
     folder.mkdir(parents=True, exist_ok=True)
     return folder

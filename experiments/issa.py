@@ -271,6 +271,6 @@ def draw(result: dict[str, Any], path: Any) -> None:
     boxes.invert_yaxis()
     _shared.tidy(
         boxes, "melanin (mg/mL of epidermis)", "",
-        "median, 50 % and 90 % by group and by site, darkest first",
+        "by group and site: median, 50 %, 90 %",
     )  # fmt: skip
     _shared.save_figure(figure, path)

@@ -18,7 +18,8 @@ WAVELENGTHS = (
     1700.0, 1940.0, 2200.0, 2500.0,
 )  # fmt: skip
 # S4's dispersed melanosomes are hit hundreds of times by a ray that is not absorbed.
-ANALOG_RAYS: Mapping[str, int] = {"S1": 8192, "S2": 8192, "S3": 8192, "S4": 4096}
+ANALOG_RAYS: Mapping[str, int] = {"S1": 4096, "S2": 4096, "S3": 4096, "S4": 1024}
+ANALOG_LOT = 1024
 # The walker's rays go out in lots, whose spread gives the covariance between wavelengths
 # that their shared paths make, and tries the standard error that the walker states.
 LOTS = 32
@@ -56,7 +57,7 @@ def run(
             )
             statistic, freedom = statistic + own_statistic, freedom + len(nm)
             specimens[name] = {
-                "analog_rays": rays,
+                "analog_rays": -(-rays // ANALOG_LOT) * ANALOG_LOT,
                 "walker_rays": lots * lot_rays,
                 "analog": _shared.significant(analog, 6),
                 "analog_error": _shared.significant(analog_error),
@@ -91,25 +92,31 @@ def run(
 def _analog(
     name: str, nm: np.ndarray, rays: int, key: jax.Array, seed: int, bar: Any
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Reflectance and its standard error, from the checkpoint where it has them."""
+    """Reflectance and its standard error; lots of rays that are done are in the checkpoint."""
     folder = _shared.checkpoint(
-        "analog", (*_shared.TRANSPORT, "simulation"), specimen=name, rays=rays, seed=seed
+        "analog", (*_shared.TRANSPORT, "simulation"), specimen=name, seed=seed, lot=ANALOG_LOT
     )
+    lots = -(-rays // ANALOG_LOT)
     found = []
     for wavelength in nm:
         path = folder / f"{wavelength:g}.json"
-        if not path.exists():
-            own = jax.random.fold_in(key, round(wavelength * 10))
+        done = json.loads(path.read_text()) if path.exists() else []
+        own = jax.random.fold_in(key, round(wavelength * 10))
+        for lot in range(len(done), lots):
             curve = simulate(
-                Specimen.preset(name), [wavelength], method="analog", rays=rays, key=own
-            )
+                Specimen.preset(name), [wavelength], method="analog", rays=ANALOG_LOT,
+                key=jax.random.fold_in(own, lot),
+            )  # fmt: skip
+            done.append(float(curve.reflectance[0]))
             partial = path.with_suffix(".partial")
-            partial.write_text(json.dumps([curve.reflectance[0], curve.standard_error[0]]))
+            partial.write_text(json.dumps(done))
             partial.replace(path)
-        found.append(json.loads(path.read_text()))
+        found.append(np.mean(done[:lots]))
         bar.update(1)
-    reflectance, error = np.array(found).T
-    return reflectance, error
+    mean, sent = np.array(found), lots * ANALOG_LOT
+    # one ray more of each kind keeps the error of a rare outcome above 0, as in `simulate`
+    p = (mean * sent + 1.0) / (sent + 2.0)
+    return mean, np.sqrt(p * (1.0 - p) / sent)
 
 
 def _walker(

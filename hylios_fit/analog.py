@@ -26,7 +26,6 @@ from hylios_fit import fresnel, melanosome, scattering
 from hylios_fit.skin import Layers
 
 OUTSIDE, BELOW = -1, 6
-SIDE_BY_SIDE = 256
 
 
 class _Ray(NamedTuple):
@@ -148,18 +147,22 @@ def _particle(
     k = jax.random.split(key, 8)
     a, b = (jnp.asarray(x, dtype) * size for x in melanosome.semi_axes(form))
     spheroid = form == "dispersed"
-    outer = (a, b) if spheroid else (jnp.asarray(melanosome.sphere_radius(form), dtype) * size,) * 2
-    cos_axis = melanosome.axis_cosine(a, b, _uniform(k[0], dtype)) if spheroid else jnp.ones((), dtype)
+    if spheroid:
+        outer_a, outer_b = a, b
+        cos_axis = melanosome.axis_cosine(a, b, _uniform(k[0], dtype))
+    else:
+        outer_a = outer_b = jnp.asarray(melanosome.sphere_radius(form), dtype) * size
+        cos_axis = jnp.ones((), dtype)
     beta, phi = (2.0 * jnp.pi * _uniform(k[i], dtype) for i in (1, 2))
     radius = jnp.sqrt(_uniform(k[3], dtype))
-    parts = melanosome.entry_point(*outer, cos_axis, radius, (jnp.cos(phi), jnp.sin(phi)))
+    parts = melanosome.entry_point(outer_a, outer_b, cos_axis, radius, (jnp.cos(phi), jnp.sin(phi)))
     p, q = (jnp.stack(v) for v in fresnel.basis((ray.u[0], ray.u[1], ray.u[2])))
     g = jnp.cos(beta) * p + jnp.sin(beta) * q
     across = jnp.cos(beta) * q - jnp.sin(beta) * p
     centre = -(parts[0] * g + parts[1] * ray.u + parts[2] * across)
     axis = jnp.sqrt(jnp.clip(1.0 - cos_axis**2, 0.0, 1.0)) * g + cos_axis * ray.u
 
-    a2, b2 = (outer[0] / size) ** 2, (outer[1] / size) ** 2
+    a2, b2 = (outer_a / size) ** 2, (outer_b / size) ** 2
 
     def half_width(size_, axis_, along):
         return size_ * jnp.sqrt(a2 + (b2 - a2) * jnp.dot(axis_, along) ** 2)
@@ -183,7 +186,7 @@ def _particle(
         number = jnp.floor(chord + _uniform(k[4], dtype)).astype(jnp.int32)
 
     def meet(state):
-        i, survived = state
+        i, _ = state
         inside, _ = melanosome.trace_inside(jax.random.fold_in(k[5], i), a, b, m.melanin, ratio)
         return i + 1, inside
 
@@ -220,15 +223,19 @@ def _event(ray: _Ray, m: _One, form: str, independent: bool) -> _Ray:
     particle = ~interface & ~absorbed & (nearest == to_particle)
     fibre = ~interface & ~absorbed & (nearest == to_fibre)
     tissue = ~interface & ~absorbed & (nearest == to_tissue)
-    there, taken, found = _particle(k[4], ray, m, form, depth, before)
+    there, taken, found = jax.lax.cond(
+        particle,
+        lambda: _particle(k[4], ray, m, form, depth, before),
+        lambda: (jnp.array(False), jnp.array(False), before),
+    )
     hit = particle & (there | independent)
 
     phi = 2.0 * jnp.pi * _uniform(k[5], dtype)
     bends = m.theta_0 > 0
-    theta = jnp.where(bends, _algorithm_1(k[6], jnp.where(bends, m.theta_0, 0.1)), 0.0)
-    cos_s = jnp.where(hit, jnp.cos(theta), 1.0)
-    cos_s = jnp.where(fibre, _algorithm_2(k[6], dtype), cos_s)
-    cos_s = jnp.where(tissue, 2.0 * _uniform(k[6], dtype) - 1.0, cos_s)
+    one = jnp.ones((), dtype)
+    cos_s = jax.lax.cond(hit & bends, lambda: jnp.cos(_algorithm_1(k[6], m.theta_0)), lambda: one)
+    cos_s = jax.lax.cond(fibre, lambda: _algorithm_2(k[6], dtype), lambda: cos_s)
+    cos_s = jax.lax.select(tissue, 2.0 * _uniform(k[6], dtype) - 1.0, cos_s)
     turned = hit | fibre | tissue
     return ray._replace(
         key=key,
@@ -260,23 +267,23 @@ def _trace(key: Array, m: _One, form: str, incidence: Array, independent: bool) 
     def step(state):
         ray, fate = state
         outside = ray.layer == OUTSIDE
-        crossed, left = _interface(ray, m)
-        moved = _event(ray._replace(layer=jnp.clip(ray.layer, 0, 5)), m, form, independent)
-        new = jax.tree.map(lambda a, b: jnp.where(ray.at_interface, a, b), crossed, moved)
-        gone = ray.at_interface & left
-        return new, jnp.where(gone, jnp.where(outside, 2, 1), fate)
+        new, left = jax.lax.cond(
+            ray.at_interface,
+            lambda: _interface(ray, m),
+            lambda: (_event(ray, m, form, independent), jnp.array(False)),
+        )
+        return new, jnp.where(left, jnp.where(outside, 2, 1), fate)
 
     start = (ray, jnp.asarray(0, jnp.int32))
-    return jax.lax.while_loop(lambda s: s[0].alive, step, start)[1]
+    end: tuple[_Ray, Array] = jax.lax.while_loop(lambda s: s[0].alive, step, start)
+    return end[1]
 
 
 @partial(jax.jit, static_argnames=("form", "rays", "independent"))
 def _fates(key, m: _One, form: str, incidence, rays: int, independent: bool) -> Array:
     keys = jax.random.split(key, rays)
-    # few rays side by side, since all of them wait for the slowest
-    fate = jax.lax.map(
-        lambda k: _trace(k, m, form, incidence, independent), keys, batch_size=min(rays, SIDE_BY_SIDE)
-    )
+    # one ray after the other: side by side, all would wait for the slowest at every loop
+    fate = jax.lax.map(lambda k: _trace(k, m, form, incidence, independent), keys)
     return jnp.stack([jnp.sum(fate == 1), jnp.sum(fate == 2)])
 
 

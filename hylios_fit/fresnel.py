@@ -39,9 +39,7 @@ def refracted_cosine(
     return jnp.where(inside, jnp.sqrt(jnp.where(inside, 1.0 - sin2, 1.0)), 0.0)
 
 
-def facet_density(
-    cos_s: Float[Array, "..."], roughness: Float[Array, ""]
-) -> Float[Array, "..."]:
+def facet_density(cos_s: Float[Array, "..."], roughness: Float[Array, ""]) -> Float[Array, "..."]:
     """Eq. 8 as a normalised density of the facet's polar cosine on [0, 1]."""
     s2 = roughness**2
     k = jnp.sqrt(1.0 - s2)

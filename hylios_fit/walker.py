@@ -202,9 +202,7 @@ def _collide(lane: _Lane, m: _Medium, hero: Array, theta_0: Array, step: Array, 
     before = lane.before
     if before:
         bx, by, bz, ex, ey, ez, bsize = before
-        bx, by, bz = (
-            r - distance * d for r, d in zip((bx, by, bz), lane.u, strict=True)
-        )
+        bx, by, bz = (r - distance * d for r, d in zip((bx, by, bz), lane.u, strict=True))
         size = _pick(m.particle, layer - 1)
         a, b = m.axes[0], m.axes[1]
         u9, u10, _, _ = _stage(_uniform(lane.ray, step, 2, key, dtype))
@@ -260,9 +258,7 @@ def _collide(lane: _Lane, m: _Medium, hero: Array, theta_0: Array, step: Array, 
     cos_m, sin_m = jnp.cos(theta), jnp.sin(theta)
     bends = hit | drawn_again
     accepted = scattering.exponential_accepts(theta, sin_m, u10)
-    cos_f = jnp.where(
-        tissue, 2.0 * u3 - 1.0, scattering.rayleigh_cosine(u7, u8, u3, u10)
-    )
+    cos_f = jax.lax.select(tissue, 2.0 * u3 - 1.0, scattering.rayleigh_cosine(u7, u8, u3, u10))
     cos_new = jnp.where(bends, cos_m, cos_f)
     sin_new = jnp.where(bends, sin_m, jnp.sqrt(jnp.clip(1.0 - cos_f**2, 0.0, 1.0)))
     turns = (bends & accepted) | fibre | tissue
@@ -399,7 +395,6 @@ def _walk(
             hero = heroes[jnp.clip(place, 0, rays - 1)]
             theta_0 = medium.nodes[nodes[jnp.clip(place, 0, rays - 1)]]
 
-
             def collide(_, carry):
                 step, lane = carry
                 return step + 1, _collide(lane, medium, hero, theta_0, step + 1, key)
@@ -454,7 +449,6 @@ def walk(
     give the same paths.
     """
     medium = _medium(layers, form, absorb)
-    k = layers.mu_a.shape[1]
     bits = jax.random.bits(key, (2,), jnp.uint32)
     if heroes is None:
         heroes = choose_heroes(layers.theta_0, bits, first, rays)

@@ -8,14 +8,15 @@ from hylios_fit import table
 from hylios_fit.errors import HyliosError
 from hylios_fit.skin import SPECS
 
-RAYS = 64
+RAYS = 256
 ROWS = 24
 
 
 @pytest.fixture
 def small(monkeypatch):
-    """Chunks of eight rows."""
-    monkeypatch.setattr(table, "CHUNK", 4)
+    """Chunks of eight rows: for each form, one group of four."""
+    monkeypatch.setattr(table, "GROUPS", 1)
+    monkeypatch.setattr(table, "SHARE", 4)
 
 
 def make(path, **options):
@@ -100,16 +101,21 @@ def test_a_table_goes_on_where_it_stopped(small, tmp_path, monkeypatch):
     assert not calls
 
 
-def test_a_row_does_not_depend_on_its_neighbours_design(small):
+def test_rows_of_a_group_share_paths_and_agree_with_their_own_walk(small):
     parameters, form = table.design(ROWS)
-    mine = parameters[form == 0][:4]
-    key = jax.random.key(3)
-    reflectance, error = table.walk_rows(mine, "complex", key, RAYS)
-    assert reflectance.shape == error.shape == (4, len(table.WAVELENGTHS))
-    other = np.concatenate([mine[:1], mine[:1], mine[2:]])
-    changed, _ = table.walk_rows(other, "complex", key, RAYS)
-    np.testing.assert_allclose(reflectance[[0, 2, 3]], changed[[0, 2, 3]], rtol=1e-4, atol=1e-6)
-    assert not np.allclose(reflectance[1], changed[1])
+    mine = parameters[form == 1][:4]
+    assert np.all(mine[:, : table.PATH_AXES] == mine[0, : table.PATH_AXES])
+    shared, error = table.walk_rows(mine, "dispersed", jax.random.key(3), 1024)
+    assert shared.shape == error.shape == (4, len(table.WAVELENGTHS))
+    again = np.repeat(mine[2:3], 4, axis=0)
+    alone, its_error = table.walk_rows(again, "dispersed", jax.random.key(4), 1024)
+    np.testing.assert_array_equal(alone[0], alone[1])
+    # neighbouring wavelengths share paths, so that their deviations are not independent
+    z = (shared[2] - alone[2]) / np.maximum(np.hypot(error[2], its_error[2]), 1e-9)
+    assert np.abs(z).max() < 6
+    assert np.sqrt(np.mean(z**2)) < 2
+    with pytest.raises(HyliosError, match="must have the same melanosome contents"):
+        table.walk_rows(parameters[form == 0][2:6], "complex", jax.random.key(3), 256)
 
 
 def empty(path):
@@ -125,12 +131,12 @@ def test_tables_that_cannot_be_gone_on_with_are_refused(small, tmp_path):
         make(path)
     with pytest.raises(HyliosError, match="begun with seed 0, not 5"):
         make(path, resume=True, seed=5)
-    with pytest.raises(HyliosError, match="begun with rays_per_row 64, not 32"):
+    with pytest.raises(HyliosError, match="begun with rays 256, not 32"):
         table.generate(path, rows=ROWS, rays=32, resume=True, progress=False)
     with pytest.raises(HyliosError, match="has 24 rows, asked for 40"):
         table.generate(path, rows=40, rays=RAYS, resume=True, progress=False)
-    with pytest.raises(HyliosError, match="at least 8 rows, asked for 7"):
-        table.generate(tmp_path / "new.zarr", rows=7, progress=False)
+    with pytest.raises(HyliosError, match="multiple of 8 rows, asked for 12"):
+        table.generate(tmp_path / "new.zarr", rows=12, progress=False)
     assert not (tmp_path / "new.zarr").exists()
 
 
@@ -138,7 +144,7 @@ def test_other_versions_are_refused(tmp_path):
     import zarr
 
     path = empty(tmp_path / "t.zarr")
-    assert table.open_table(path).attrs["rays_per_row"] == RAYS
+    assert table.open_table(path).attrs["rays"] == RAYS
     zarr.open_group(path, mode="r+").attrs["format_version"] = table.FORMAT_VERSION + 1
     with pytest.raises(HyliosError, match=r"version 2 .* reads version 1"):
         table.open_table(path)

@@ -309,7 +309,7 @@ def test_both_precisions_agree(found):
         layers = S3.layers(NM, jnp.float64)
         double = tally.collect(walk(layers, jax.random.key(11)), layers, layers)
         assert double.mean.dtype == jnp.float64
-    within(found, double)
+        within(found, double)
 
 
 def test_weights_in_single_precision_are_those_in_double(paths, layers, found):
@@ -427,7 +427,7 @@ def test_the_walk_agrees_with_the_paper_to_the_letter(preset, alone):
     paths = walk(layers, jax.random.key(14), independent=alone)
     found = tally.collect(paths, layers, layers)
     surface = fresnel.surface_reflectance(math.radians(8), 1.0, 1.55, specimen.roughness)
-    rays = 1024
+    rays = 4096
     total = 0.0
     for i in range(len(NM)):
         inside, top = analog.trace(
@@ -442,8 +442,8 @@ def test_the_walk_agrees_with_the_paper_to_the_letter(preset, alone):
 
 
 def test_the_literal_walk_returns_all_light_that_nothing_absorbs():
-    clear = without_absorption(S3.replace(melanosome_basale=0.3).layers(NM))
+    clear = without_absorption(S3.layers(NM))
     none = jnp.zeros(len(NM), jnp.float32)
-    inside, top = analog.trace(clear, none, "complex", 1, jax.random.key(16), 64)
-    assert inside + top == 64
-    assert inside > 50
+    inside, top = analog.trace(clear, none, "complex", 1, jax.random.key(16), 256)
+    assert inside + top == 256
+    assert inside > 200
