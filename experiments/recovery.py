@@ -25,7 +25,7 @@ from experiments import _shared
 
 STEP_NM = 10.0
 SPECIMENS = 200
-RAYS = 262_144  # of the walker for a specimen
+RAYS = 131_072  # of the walker for a specimen
 THREADS = 2
 ANALOG_RAYS = 100_000
 ABSORB = 0.5  # as in `simulate`

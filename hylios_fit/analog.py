@@ -272,11 +272,10 @@ def _trace(key: Array, m: _One, form: str, incidence: Array, independent: bool) 
             lambda: _interface(ray, m),
             lambda: (_event(ray, m, form, independent), jnp.array(False)),
         )
-        return new, jnp.where(left, jnp.where(outside, 2, 1), fate)
+        return new, fate + left * (1 + outside)
 
     start = (ray, jnp.asarray(0, jnp.int32))
-    end: tuple[_Ray, Array] = jax.lax.while_loop(lambda s: s[0].alive, step, start)
-    return end[1]
+    return jax.lax.while_loop(lambda s: s[0].alive, step, start)[1]
 
 
 @partial(jax.jit, static_argnames=("form", "rays", "independent"))

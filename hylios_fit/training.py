@@ -14,9 +14,9 @@ from hylios_fit.surrogate import FLOOR, features
 from hylios_fit.table import PATH_AXES, open_table
 
 COMPONENTS = 12
-HIDDEN = (48, 48)
-ENSEMBLE = 4
-PENALTY = 0.03
+HIDDEN = (64, 64)
+ENSEMBLE = 3
+PENALTY = 0.003
 HELD_OUT = 0.12
 LEAST_ROWS = 64  # of each form
 MODES = 12
@@ -110,7 +110,7 @@ def _fit(x: np.ndarray, log: np.ndarray, seed: int) -> dict[str, np.ndarray]:
         for number in range(ENSEMBLE):
             network = MLPRegressor(
                 hidden_layer_sizes=HIDDEN, activation="tanh", solver="lbfgs", alpha=PENALTY,
-                max_iter=1500, max_fun=30_000, random_state=seed + number,
+                max_iter=4000, max_fun=80_000, tol=1e-6, random_state=seed + number,
             ).fit(scaler.transform(x), scores / unit)  # fmt: skip
             layers.append([*network.coefs_, *network.intercepts_])
     depth = len(HIDDEN) + 1

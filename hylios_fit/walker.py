@@ -263,7 +263,7 @@ def _collide(lane: _Lane, m: _Medium, hero: Array, theta_0: Array, step: Array, 
     sin_new = jnp.where(bends, sin_m, jnp.sqrt(jnp.clip(1.0 - cos_f**2, 0.0, 1.0)))
     turns = (bends & accepted) | fibre | tissue
     # a hit has used up the other numbers, but what the test for absorption left of its own is free
-    azimuth = 2.0 * jnp.pi * jnp.where(hit, _last(u2, absorb, rate), u5)
+    azimuth = 2.0 * jnp.pi * jax.lax.select(hit, _last(u2, absorb, rate), u5)
     cos_new, sin_new, azimuth, turns, bends, accepted = _stage(
         (cos_new, sin_new, azimuth, turns, bends, accepted)
     )

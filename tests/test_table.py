@@ -140,7 +140,7 @@ def test_tables_that_cannot_be_gone_on_with_are_refused(small, tmp_path):
     assert not (tmp_path / "new.zarr").exists()
 
 
-def test_other_versions_are_refused(tmp_path):
+def test_other_versions_are_refused(small, tmp_path):
     import zarr
 
     path = empty(tmp_path / "t.zarr")
