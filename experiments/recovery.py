@@ -61,7 +61,7 @@ def run(
     nm = bands()
     simulated = simulated or partial(walked, names=member.names, rays=rays)
     folder = _shared.checkpoint(
-        "recovery", _shared.TRANSPORT, truths=truths.tolist(), rays=rays, seed=seed,
+        "recovery", _shared.WALK, truths=truths.tolist(), rays=rays, seed=seed,
         bands=nm.tolist(), by=getattr(simulated, "__name__", "walker"),
     )  # fmt: skip
 
@@ -149,16 +149,20 @@ def mean_and_covariance(paths: Any, layers: Any) -> tuple[np.ndarray, np.ndarray
     Every wavelength sends its own share of the rays, so that the error is what the weights scatter
     about the mean of those that were sent by one wavelength.
     """
-    weights = np.asarray(_weights(paths, layers), np.float64)
-    hero = np.asarray(paths.hero)
-    count = np.bincount(hero, minlength=weights.shape[1])
-    order = np.argsort(hero, kind="stable")
-    first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    mean_of_hero = np.add.reduceat(weights[order], first, axis=0) / count[:, None]
-    scatter = weights - mean_of_hero[hero]
-    # count / (count - 1): the means were taken from the same rays
-    scatter *= np.sqrt(count / (count - 1.0))[hero][:, None]
-    return weights.mean(axis=0), scatter.T @ scatter / len(weights) ** 2
+    from scipy.sparse import csr_array
+
+    hero, back = np.asarray(paths.hero), np.asarray(paths.escaped) > 0
+    count = np.bincount(hero, minlength=layers.mu_a.shape[1])
+    weights = np.asarray(_weights(paths, layers))[back].astype(np.float64)
+    rows = np.arange(len(weights))
+    sent_for = csr_array((np.ones(len(rows)), (hero[back], rows)), shape=(len(count), len(rows)))
+    mean_of_hero = (sent_for @ weights) / np.maximum(count, 1)[:, None]
+    # count / (count - 1): the means are from the same rays
+    share = count / np.maximum(count - 1.0, 1.0)
+    scaled = weights * np.sqrt(share)[hero[back], None]
+    about_zero = scaled.T @ scaled
+    scatter = about_zero - (mean_of_hero.T * (share * count)) @ mean_of_hero
+    return weights.sum(axis=0) / hero.size, 0.5 * (scatter + scatter.T) / hero.size**2
 
 
 @jax.jit

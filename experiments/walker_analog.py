@@ -94,7 +94,7 @@ def _analog(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reflectance and its standard error; lots of rays that are done are in the checkpoint."""
     folder = _shared.checkpoint(
-        "analog", (*_shared.TRANSPORT, "simulation"), specimen=name, seed=seed, lot=ANALOG_LOT
+        "analog", (*_shared.WALK, "analog", "simulation"), specimen=name, seed=seed, lot=ANALOG_LOT
     )
     lots = -(-rays // ANALOG_LOT)
     found = []

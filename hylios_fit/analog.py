@@ -272,7 +272,8 @@ def _trace(key: Array, m: _One, form: str, incidence: Array, independent: bool) 
             lambda: _interface(ray, m),
             lambda: (_event(ray, m, form, independent), jnp.array(False)),
         )
-        return new, fate + left * (1 + outside)
+        way_out = jax.lax.select(outside, jnp.int32(2), jnp.int32(1))
+        return new, jax.lax.select(left, way_out, fate)
 
     start = (ray, jnp.asarray(0, jnp.int32))
     return jax.lax.while_loop(lambda s: s[0].alive, step, start)[1]

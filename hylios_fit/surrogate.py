@@ -100,7 +100,8 @@ class Member(eqx.Module):
         log = scores @ self.components + self.mean.reshape(like)
         spectrum = self.surface + (1.0 - self.surface) * (jnp.exp(log) - FLOOR)
         part = self.part.reshape(like)
-        bands = (1.0 - part) * spectrum[..., self.low] + part * spectrum[..., self.high]
+        below, above = (jnp.take(spectrum, at, axis=-1, mode="clip") for at in (self.low, self.high))
+        bands = (1.0 - part) * below + part * above
         return jnp.where(inside, bands, jnp.nan)
 
     # arrays have no hash, and jax.jit wants one of what it compiles
@@ -139,8 +140,8 @@ class Member(eqx.Module):
                 self.components[:, columns],
                 self.mean[columns],
                 bands,
-                place[: len(bands)],
-                place[len(bands) :],
+                place[: len(bands)].astype(np.int32),
+                place[len(bands) :].astype(np.int32),
                 jnp.asarray(part, dtype),
                 jnp.asarray((1 - part) * modes[:, low] + part * modes[:, low + 1], dtype),
                 # not averaged down: neighbouring wavelengths err together
@@ -314,7 +315,7 @@ def _member(form: str, arrays: dict[str, np.ndarray], about: dict[str, Any]) -> 
 
     depth = int(about["depth"])
     w = len(arrays["wavelength_nm"])
-    everywhere = np.arange(w)
+    everywhere = np.arange(w, dtype=np.int32)  # of one width, with and without JAX's x64
     return Member(
         names=tuple(about["names"]),
         form=form,

@@ -77,7 +77,7 @@ def collect(
         p = p + jnp.where(hit, node_walk[node], 0.0)
         q = q + jnp.where(hit, node_asked[node], 0.0)
         if own_only:
-            own = hero[:, None] == jnp.arange(p.shape[1])[None]
+            own = hero[:, None] == jnp.arange(p.shape[1], dtype=hero.dtype)[None]
             p = jnp.where(own, p, never)
             q = jnp.where(own, q, never)
         total = jax.nn.logsumexp(p, axis=1, keepdims=True)

@@ -307,9 +307,12 @@ def test_the_same_key_gives_the_same_paths(paths, layers):
 def test_both_precisions_agree(found):
     with jax.enable_x64(True):
         layers = S3.layers(NM, jnp.float64)
-        double = tally.collect(walk(layers, jax.random.key(11)), layers, layers)
+        paths = walk(layers, jax.random.key(11))
+        double = tally.collect(paths, layers, layers)
         assert double.mean.dtype == jnp.float64
         within(found, double)
+        alone = tally.collect(paths, layers, layers, own_only=True)
+        within(double, alone)
 
 
 def test_weights_in_single_precision_are_those_in_double(paths, layers, found):
