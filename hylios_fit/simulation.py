@@ -74,9 +74,7 @@ def simulate(
         [fresnel.surface_reflectance(angle, 1.0, float(n), specimen.roughness) for n in index[0]]
     )
     run = _walked if method == "walker" else _traced
-    return run(
-        specimen, nm, surface, rays, key, angle, tolerance, independent_particles, progress
-    )
+    return run(specimen, nm, surface, rays, key, angle, tolerance, independent_particles, progress)
 
 
 def _check(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import itertools
 import json
 import zipfile
 from functools import lru_cache
@@ -17,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from hylios_fit import datasets, melanosome
@@ -100,7 +101,9 @@ class Member(eqx.Module):
         log = scores @ self.components + self.mean.reshape(like)
         spectrum = self.surface + (1.0 - self.surface) * (jnp.exp(log) - FLOOR)
         part = self.part.reshape(like)
-        below, above = (jnp.take(spectrum, at, axis=-1, mode="clip") for at in (self.low, self.high))
+        below, above = (
+            jnp.take(spectrum, at, axis=-1, mode="clip") for at in (self.low, self.high)
+        )
         bands = (1.0 - part) * below + part * above
         return jnp.where(inside, bands, jnp.nan)
 
@@ -189,7 +192,7 @@ class Surrogate(eqx.Module):
 
     def __call__(self, parameters: Float[Array, "... q"]) -> Float[Array, "... w"]:
         p = jnp.asarray(parameters)
-        if not isinstance(p, jax.core.Tracer):
+        if not isinstance(p, Tracer):
             self.check(np.asarray(parameters, float))
         form = p[..., -1:]
         first, second = (member(p[..., :-1]) for member in self.members.values())
@@ -243,9 +246,11 @@ def save(path: str | Path, arrays: dict[str, np.ndarray], about: dict[str, Any])
     path = Path(path)
     about = {**about, "format": FORMAT, "format_version": FORMAT_VERSION, "sha256": _hash(arrays)}
     buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer, about=np.frombuffer(json.dumps(about).encode(), np.uint8), **arrays
-    )
+    content: dict[str, Any] = {
+        "about": np.frombuffer(json.dumps(about).encode(), np.uint8),
+        **arrays,
+    }
+    np.savez_compressed(buffer, **content)
     temporary = path.with_name(f".{path.name}.tmp")
     try:
         temporary.write_bytes(buffer.getvalue())
@@ -360,7 +365,7 @@ def check_report(surrogate: Surrogate) -> str:
     edges = [250, 300, 350, 400, 450, 500, 550, 600, 650, 700, 800, 900, 1000, 1100, 1200, 1300]
     edges += [1400, 1600, 1800, 2000, 2500]
     bands = []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in itertools.pairwise(edges):
         use = (grid >= low) & (grid <= high)
         values = [float(np.sqrt(np.mean(error[f][use] ** 2))) for f in surrogate.forms]
         bands.append((max(values), f"  {low:5d} to {high:5d}      ", values))

@@ -60,7 +60,9 @@ def train(
         x = np.asarray(features(names, jnp.asarray(table["design"].values[mine], jnp.float32)))
         share = np.clip((reflectance[mine] - surface) / (1.0 - surface), 0.0, None)
         # whole sets of paths are held out: rows that share paths share their noise
-        _, group = np.unique(table["design"].values[mine][:, :PATH_AXES], axis=0, return_inverse=True)
+        _, group = np.unique(
+            table["design"].values[mine][:, :PATH_AXES], axis=0, return_inverse=True
+        )
         drawn = np.random.default_rng(seed).permutation(group.max() + 1)
         test = drawn[group] < HELD_OUT * (group.max() + 1)
         held_out_rows += int(test.sum())
@@ -104,7 +106,7 @@ def _fit(x: np.ndarray, log: np.ndarray, seed: int) -> dict[str, np.ndarray]:
     pca = PCA(min(COMPONENTS, len(x) // 4), random_state=seed).fit(log)
     scores = pca.transform(log)
     unit = scores[:, 0].std()  # one scale for all, so that what matters more weighs more
-    layers: list[list[np.ndarray]] = []
+    layers: list[list[Any]] = []
     with warnings.catch_warnings(), threadpool_limits(1):
         warnings.simplefilter("ignore", ConvergenceWarning)  # the budget is the regularisation
         for number in range(ENSEMBLE):
@@ -117,7 +119,7 @@ def _fit(x: np.ndarray, log: np.ndarray, seed: int) -> dict[str, np.ndarray]:
     stacked = [np.stack(arrays) for arrays in zip(*layers, strict=True)]
     stacked[depth - 1] = stacked[depth - 1] * unit
     stacked[-1] = stacked[-1] * unit
-    return {
+    found = {
         "centre": scaler.mean_,
         "scale": scaler.scale_,
         "components": pca.components_,
@@ -125,6 +127,7 @@ def _fit(x: np.ndarray, log: np.ndarray, seed: int) -> dict[str, np.ndarray]:
         **{f"weight{i}": stacked[i] for i in range(depth)},
         **{f"bias{i}": stacked[depth + i] for i in range(depth)},
     }
+    return {name: np.asarray(value, float) for name, value in found.items()}
 
 
 def _predict(fitted: dict[str, np.ndarray], x: np.ndarray) -> np.ndarray:

@@ -52,8 +52,10 @@ def test_refuses(options, said):
 def test_a_curve_adds_up(curves):
     curve = curves["plain"]
     assert np.allclose(curve.surface + curve.subsurface, curve.reflectance)
-    assert (curve.standard_error > 0).all() and (curve.standard_error < 0.02).all()
-    assert (curve.effective_rays > 100).all() and curve.rays == 16_384
+    assert (curve.standard_error > 0).all()
+    assert (curve.standard_error < 0.02).all()
+    assert (curve.effective_rays > 100).all()
+    assert curve.rays == 16_384
 
 
 def test_a_bottom_that_absorbs_darkens(curves):
@@ -83,7 +85,8 @@ def test_dispersion_changes_the_surface(curves):
 def test_a_tolerance_adds_rays_until_it_is_met_or_says_so(monkeypatch):
     monkeypatch.setattr(simulation.walker, "BATCH", 4096)
     met = simulate(Specimen(), NM, tolerance=0.012, key=jax.random.key(1))
-    assert met.standard_error.max() <= 0.012 and met.note == ""
+    assert met.standard_error.max() <= 0.012
+    assert met.note == ""
     assert met.rays % 4096 == 0
     monkeypatch.setattr(simulation, "MOST_RAYS", 4096)
     short = simulate(Specimen(), NM, tolerance=1e-4, key=jax.random.key(1))
