@@ -3,7 +3,9 @@
 Traces rays with hylios_fit.melanosome.trace_inside (no absorption), for the light and the dark
 spheroid and for index ratios melanin over surroundings, and keeps the distribution of the path
 length as weights on fixed, geometrically spaced lengths; each ray's weight is shared by its two
-neighbours so that the mean path stays exact. Run from the repository: python data/make_melanosome_paths.py
+neighbours so that the mean path stays exact.
+
+Run from the repository: python data/make_melanosome_paths.py
 """
 
 import csv

@@ -53,7 +53,7 @@ def simulate(
     independent_particles: bool = False,
     progress: bool = False,
 ) -> Curve:
-    """Reflectance of `specimen` at `wavelengths` (nm, 250 to 2500) for light at `incidence` degrees.
+    """Reflectance of `specimen` at `wavelengths` (nm, 250 to 2500) and `incidence` (degrees).
 
     `walker` spreads `rays` over all wavelengths and shares their paths; `analog` sends `rays` rays
     at each wavelength; `surrogate` asks the embedded one (8 degrees, its own training range).

@@ -30,7 +30,7 @@ from hylios_fit.skin import Specimen
 FORMAT = "hylios_fit surrogate"
 FORMAT_VERSION = 1
 FLOOR = 0.02
-"""Added to the subsurface reflectance before the logarithm, so that dark bands are not all noise."""
+"""Added to the subsurface reflectance before the logarithm: dark bands are not all noise."""
 
 # Features: log(x + offset) of what may be 0, log of what may not, the rest as it is
 OFFSETS = {
@@ -113,7 +113,7 @@ class Member(eqx.Module):
 
     @property
     def error_covariance(self) -> np.ndarray:
-        """Covariance (B, B) of the surrogate's own error in reflectance, from held-out specimens."""
+        """Covariance (B, B) of its own error in reflectance, from held-out specimens."""
         modes = np.asarray(self.modes, float)
         return modes.T @ modes + np.diag(np.asarray(self.rest, float))
 
@@ -203,7 +203,8 @@ class Surrogate(eqx.Module):
         p = np.atleast_2d(parameters)
         if p.shape[-1] != len(self.names):
             raise HyliosError(
-                f"expected {len(self.names)} parameters ({', '.join(self.names)}), got {p.shape[-1]}"
+                f"expected {len(self.names)} parameters ({', '.join(self.names)}), "
+                f"got {p.shape[-1]}"
             )
         member = self.at(self.forms[0])
         lower, upper = np.asarray(member.lower, float), np.asarray(member.upper, float)
