@@ -270,3 +270,29 @@ def test_fit_of_good_spectra_ends_with_0_and_samples_when_asked(toy, folder, spe
     page.unlink()
     assert run("report", "out") == 0
     assert "good" in page.read_text(encoding="utf-8")
+
+
+# --- table, train, check -----------------------------------------------------------------------
+
+
+def test_a_table_is_made_trained_from_and_checked(folder, monkeypatch, capsys):
+    from hylios_fit import table, training
+
+    def stand_in(parameters, form, key, rays):
+        depth = parameters[:, 3:4] * (500 / table.WAVELENGTHS) ** 3 / 5
+        return 0.05 + 0.6 * np.exp(-depth), np.full(depth.shape, 1e-3)
+
+    monkeypatch.setattr(table, "walk_rows", stand_in)
+    monkeypatch.setattr(training, "HIDDEN", (8, 8))
+    assert run("table", "-o", "t.zarr", "--rows", 256, "--seed", 5) == 0
+    assert run("table", "-o", "t.zarr", "--rows", 256) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert run("table", "-o", "t.zarr", "--rows", 256, "--seed", 5, "--resume") == 0
+    assert run("train", "t.zarr", "-o", "s.npz") == 0
+    capsys.readouterr()
+    assert run("check", "s.npz") == 0
+    said = capsys.readouterr().out
+    assert "256 rows" in said
+    assert "worst band" in said
+    assert {path.name for path in folder.iterdir()} >= {"t.zarr", "s.npz"}
+    assert not list(folder.glob(".*"))
