@@ -124,15 +124,15 @@ def walked(
     truth: np.ndarray, form: str, names: tuple[str, ...], rays: int, key: jax.Array
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reflectance (B,) of a specimen by the walker, and the covariance (B, B) of its error."""
-    from hylios_fit import fresnel, walker
+    from hylios_fit import fresnel, tally, walker
     from hylios_fit.skin import Specimen
 
     specimen = Specimen(dict(zip(names, truth.tolist(), strict=True)), form, "drawn")
     layers = specimen.layers(bands())
     batch = min(walker.BATCH, rays)
     lots = [
-        mean_and_covariance(
-            walker.walk(layers, form, key, first=first, rays=batch, absorb=ABSORB), layers
+        tally.moments(
+            walker.walk(layers, form, key, first=first, rays=batch, absorb=ABSORB), layers, ABSORB
         )
         for first in range(0, rays, batch)
     ]
@@ -141,39 +141,6 @@ def walked(
     angle = float(np.radians(8.0))
     surface = fresnel.surface_reflectance(angle, 1.0, specimen.index_corneum, specimen.roughness)
     return surface + (1.0 - surface) * mean, (1.0 - surface) ** 2 * covariance
-
-
-def mean_and_covariance(paths: Any, layers: Any) -> tuple[np.ndarray, np.ndarray]:
-    """What `tally.collect` gives as the mean, and the covariance of its error between wavelengths.
-
-    Every wavelength sends its own share of the rays, so that the error is what the weights scatter
-    about the mean of those that were sent by one wavelength.
-    """
-    from scipy.sparse import csr_array
-
-    hero, back = np.asarray(paths.hero), np.asarray(paths.escaped) > 0
-    count = np.bincount(hero, minlength=layers.mu_a.shape[1])
-    weights = np.asarray(_weights(paths, layers))[back].astype(np.float64)
-    rows = np.arange(len(weights))
-    sent_for = csr_array((np.ones(len(rows)), (hero[back], rows)), shape=(len(count), len(rows)))
-    mean_of_hero = (sent_for @ weights) / np.maximum(count, 1)[:, None]
-    # count / (count - 1): the means are from the same rays
-    share = count / np.maximum(count - 1.0, 1.0)
-    scaled = weights * np.sqrt(share)[hero[back], None]
-    about_zero = scaled.T @ scaled
-    scatter = about_zero - (mean_of_hero.T * (share * count)) @ mean_of_hero
-    return weights.sum(axis=0) / hero.size, 0.5 * (scatter + scatter.T) / hero.size**2
-
-
-@jax.jit
-def _weights(paths: Any, layers: Any) -> jax.Array:
-    """(ray, wavelength) what each ray adds to the tally."""
-    from hylios_fit import tally
-
-    def one(ray: Any) -> jax.Array:
-        return tally.collect(jax.tree.map(lambda a: a[None], ray), layers, layers, ABSORB).weight
-
-    return jax.lax.map(one, paths, batch_size=2048)
 
 
 def _fits(

@@ -16,10 +16,10 @@ Data flows one way through the modules; each imports only from those above it:
     simulation   Specimen -> Curve, by any method
     table        design of parameters, simulation, storing, resuming
     surrogate    parameters -> spectrum; knows its range and its own error
-    training     table -> surrogate
     spectra      measured spectra: read, checked, written
     instrument   bands, specular in or out, noise
     statevector  free parameters: names, order, bounds, priors, transforms
+    training     table -> surrogate, its error measured on fresh specimens
     results      Outcome, Fit, Posterior
     inversion    spectra -> fits
     sampling     fit -> posterior

@@ -34,9 +34,11 @@ def refracted_cosine(
     cos_i: Float[Array, "..."], n1: Float[Array, "..."], n2: Float[Array, "..."]
 ) -> Float[Array, "..."]:
     """Cosine of the refracted ray by Snell's law; 0 where all light is reflected."""
-    sin2 = (n1 / n2) ** 2 * (1.0 - cos_i**2)
-    inside = sin2 < 1.0
-    return jnp.where(inside, jnp.sqrt(jnp.where(inside, 1.0 - sin2, 1.0)), 0.0)
+    ratio = n1 / n2
+    # 1 - sin^2, written so that equal indices change nothing at grazing incidence in float32
+    cos2 = (1.0 - ratio) * (1.0 + ratio) + (ratio * cos_i) ** 2
+    inside = cos2 > 0.0
+    return jnp.where(inside, jnp.sqrt(jnp.where(inside, cos2, 1.0)), 0.0)
 
 
 def facet_density(cos_s: Float[Array, "..."], roughness: Float[Array, ""]) -> Float[Array, "..."]:

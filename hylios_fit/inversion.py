@@ -21,7 +21,7 @@ rule and K.T K lose too much in float32.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -162,7 +162,7 @@ class _Job:
     states: np.ndarray  # (SCAN, N)
     noise: Any  # reflectance (B,) -> covariance (B, B)
     noise_follows_reflectance: bool
-    surrogate_error: Mapping[str, np.ndarray]
+    surrogate_error: Mapping[str, Callable[[np.ndarray], np.ndarray]]
     starts: int
     settings: Mapping[str, Any]
 
@@ -197,7 +197,7 @@ def _job(
         offset = instrument.specular_offset(float(projected.surface), specular)
         scan = np.asarray(_spectra(member, vector, jnp.asarray(states))) + offset
         models.append(Model(form, member, offset, scan))
-        error[form] = np.asarray(projected.error_covariance, dtype=np.float64)
+        error[form] = projected.error_covariance
     settings = {
         "noise": noise_text,
         "free": list(vector.free),
@@ -475,7 +475,7 @@ def _inverted(job: _Job, wavelength_nm: np.ndarray, measured: np.ndarray, name: 
     # Where a band is missing the noise model gets a stand-in; its row is not used.
     level = np.where(np.isfinite(measured), measured, np.nanmedian(measured))
     noise = job.noise(level)[np.ix_(job.usable, job.usable)]
-    stated = {model.form: noise + job.surrogate_error[model.form] for model in job.models}
+    stated = _stated(job, noise, level)
     found = [_search(job, model, stated[model.form], target) for model in job.models]
     steps = sum(s.steps for s in found)
 
@@ -485,13 +485,13 @@ def _inverted(job: _Job, wavelength_nm: np.ndarray, measured: np.ndarray, name: 
         steps += sum(s.steps for s in warm)
         return warm
 
+    # An error that scales with the measured value weighs low readings more, and so pulls the fit
+    # down (Peelle's puzzle): take it at the fitted value.
+    level[job.usable] = found[np.argmax(_evidence(found))].spectrum
     if job.noise_follows_reflectance:
-        # Noise that scales with the measured value weighs low readings more, and so pulls the fit
-        # down (Peelle's puzzle): take it at the fitted value.
-        level[job.usable] = found[np.argmax(_evidence(found))].spectrum
         noise = job.noise(level)[np.ix_(job.usable, job.usable)]
-        stated = {model.form: noise + job.surrogate_error[model.form] for model in job.models}
-        found = again(stated)
+    stated = _stated(job, noise, level)
+    found = again(stated)
     reduced, significant = _reduced_chi2(found[np.argmax(_evidence(found))], target)
     if significant:
         found = again({form: covariance * reduced for form, covariance in stated.items()})
@@ -501,6 +501,14 @@ def _inverted(job: _Job, wavelength_nm: np.ndarray, measured: np.ndarray, name: 
         job, found, weights / weights.sum(), wavelength_nm, measured, name,
         stated, reduced, significant, steps,
     )  # fmt: skip
+
+
+def _stated(job: _Job, noise: np.ndarray, level: np.ndarray) -> dict[str, np.ndarray]:
+    """S_eps by form: the noise and the surrogate's own error at a reflectance."""
+    return {
+        model.form: noise + job.surrogate_error[model.form](level[job.usable] - model.offset)
+        for model in job.models
+    }
 
 
 def _evidence(found: list[_Solution]) -> np.ndarray:

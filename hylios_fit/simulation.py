@@ -186,7 +186,7 @@ def _surrogate(specimen: Specimen, nm: np.ndarray, incidence: float, independent
         )
     reflectance = surrogate.of(specimen, nm)
     member = surrogate.at(specimen.melanosome_form).on(nm)
-    error = np.sqrt(np.diag(np.asarray(member.error_covariance)))
+    error = np.sqrt(np.diag(member.error_covariance(reflectance)))
     surface = np.full(nm.shape, float(member.surface))
     return Curve(
         nm, reflectance, error, surface, reflectance - surface, "surrogate", 0,

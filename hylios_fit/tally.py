@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hylios_fit.skin import Layers
@@ -105,3 +106,36 @@ def collect(
 def add(one: Tally | None, two: Tally) -> Tally:
     """The sums of two lots of rays."""
     return two if one is None else Tally(*(a + b for a, b in zip(one, two, strict=True)))
+
+
+def moments(paths: Paths, walked: Layers, absorb: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (w,) as `collect` gives it, and the covariance (w, w) of its error between wavelengths.
+
+    Every wavelength sends its own share of the rays, so that the error is what the weights scatter
+    about the mean of those that were sent by one wavelength.
+    """
+    from scipy.sparse import csr_array
+
+    hero, back = np.asarray(paths.hero), np.asarray(paths.escaped) > 0
+    count = np.bincount(hero, minlength=walked.mu_a.shape[1])
+    weights = np.asarray(_weights(paths, walked, absorb))[back].astype(np.float64)
+    rows = np.arange(len(weights))
+    sent_for = csr_array((np.ones(len(rows)), (hero[back], rows)), shape=(len(count), len(rows)))
+    mean_of_hero = (sent_for @ weights) / np.maximum(count, 1)[:, None]
+    # count / (count - 1): the means are from the same rays
+    share = count / np.maximum(count - 1.0, 1.0)
+    scaled = weights * np.sqrt(share)[hero[back], None]
+    about_zero = scaled.T @ scaled
+    scatter = about_zero - (mean_of_hero.T * (share * count)) @ mean_of_hero
+    return weights.sum(axis=0) / hero.size, 0.5 * (scatter + scatter.T) / hero.size**2
+
+
+@jax.jit
+def _weights(paths: Paths, walked: Layers, absorb: float) -> Float[Array, "ray w"]:
+    """What each ray adds to the tally."""
+
+    def one(ray: Paths) -> Array:
+        alone = Paths(*(part[None] for part in ray))
+        return collect(alone, walked, walked, absorb).weight
+
+    return jax.lax.map(one, paths, batch_size=CHUNK)

@@ -2,32 +2,51 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hylios_fit import surrogate as surrogate_module
+from hylios_fit import tally, walker
 from hylios_fit.errors import HyliosError
-from hylios_fit.surrogate import FLOOR, features
-from hylios_fit.table import PATH_AXES, open_table
+from hylios_fit.skin import Specimen
+from hylios_fit.statevector import state_vector
+from hylios_fit.surrogate import (
+    FLOOR,
+    LEAST_INSIDE,
+    Surrogate,
+    assemble,
+    check_report,
+    features,
+    load_surrogate,
+    save,
+)
+from hylios_fit.table import ABSORB, open_table, surface_share
 
 COMPONENTS = 12
 HIDDEN = (64, 64)
 ENSEMBLE = 3
 PENALTY = 0.003
-HELD_OUT = 0.12
 LEAST_ROWS = 64  # of each form
-MODES = 12
+CHECKS = 40  # fresh specimens of each form that measure the error
+CHECK_RAYS = 131_072
+MODES = 10
 
 
 def train(
-    table_path: str | Path, out_path: str | Path, seed: int = 0, progress: bool = True
+    table_path: str | Path,
+    out_path: str | Path,
+    seed: int = 0,
+    checks: int = CHECKS,
+    progress: bool = True,
 ) -> str:
     """Train on the table and write the surrogate; returns the report that `check` prints.
 
-    An eighth of the sets of paths of each form is never seen in training and measures the error.
+    Its error is measured on `checks` fresh specimens of each form, drawn from the prior of the
+    fits and walked with many rays.
     """
     from tqdm import tqdm
 
@@ -43,14 +62,10 @@ def train(
     if not (upper > lower).all():
         raise HyliosError(f"{table_path}: the range of {names[int(np.argmin(upper - lower))]} is 0")
     surface = float(table.attrs["surface"])
+    nm = table["wavelength_nm"].values
 
-    arrays: dict[str, np.ndarray] = {
-        "wavelength_nm": table["wavelength_nm"].values,
-        "lower": lower,
-        "upper": upper,
-    }
-    held_out_rows = 0
-    for i, form in enumerate(tqdm(forms, unit="form", disable=not progress)):
+    arrays: dict[str, np.ndarray] = {"wavelength_nm": nm, "lower": lower, "upper": upper}
+    for i, form in enumerate(tqdm(forms, desc="train", unit="form", disable=not progress)):
         mine = done & (table["form"].values == i)
         if mine.sum() < LEAST_ROWS:
             raise HyliosError(
@@ -59,18 +74,8 @@ def train(
             )
         x = np.asarray(features(names, jnp.asarray(table["design"].values[mine], jnp.float32)))
         share = np.clip((reflectance[mine] - surface) / (1.0 - surface), 0.0, None)
-        # whole sets of paths are held out: rows that share paths share their noise
-        _, group = np.unique(
-            table["design"].values[mine][:, :PATH_AXES], axis=0, return_inverse=True
-        )
-        drawn = np.random.default_rng(seed).permutation(group.max() + 1)
-        test = drawn[group] < HELD_OUT * (group.max() + 1)
-        held_out_rows += int(test.sum())
-        fitted = _fit(x[~test], np.log(share[~test] + FLOOR), seed)
-        log = _predict(fitted, x[test])
-        residual = surface + (1.0 - surface) * (np.exp(log) - FLOOR) - reflectance[mine][test]
-        modes, rest = _error(residual, error[mine][test])
-        parts = {**fitted, "modes": modes, "rest": rest}
+        fitted = _fit(x, np.log(share + FLOOR), seed)
+        parts = {**fitted, "modes": np.zeros((1, nm.size)), "rest": np.zeros(nm.size)}
         arrays.update({f"{form}/{name}": a.astype(np.float32) for name, a in parts.items()})
 
     about: dict[str, Any] = {
@@ -86,10 +91,76 @@ def train(
         "table_seed": int(table.attrs["seed"]),
         "seed": seed,
         "depth": len(HIDDEN) + 1,
-        "held_out_rows": held_out_rows,
+        "held_out": f"{checks} fresh specimens of each form, {CHECK_RAYS} rays each",
+        "held_out_rms": {},
     }
-    path = surrogate_module.save(out_path, arrays, about)
-    return surrogate_module.check_report(surrogate_module.load_surrogate(path))
+    for form, found in _check(assemble(arrays, about), seed, checks, progress).items():
+        arrays[f"{form}/modes"], arrays[f"{form}/rest"] = (
+            part.astype(np.float32) for part in found[:2]
+        )
+        about["held_out_rms"][form] = [round(float(rms), 6) for rms in found[2]]
+    path = save(out_path, arrays, about)
+    return check_report(load_surrogate(path))
+
+
+def fresh(
+    surrogate: Surrogate, parameters: np.ndarray, form: str, key: jax.Array
+) -> tuple[np.ndarray, np.ndarray]:
+    """Reflectance (w,) of one specimen by the walker, and the covariance (w, w) of its error."""
+    names = surrogate.at(form).names
+    specimen = Specimen(dict(zip(names, parameters.tolist(), strict=True)), form, "drawn")
+    layers = specimen.layers(surrogate.wavelength_nm)
+    lots = [
+        tally.moments(
+            walker.walk(
+                layers, form, key, first=first, rays=walker.BATCH,
+                incidence=np.radians(surrogate.incidence_deg), absorb=ABSORB,
+            ),
+            layers, ABSORB,
+        )
+        for first in range(0, CHECK_RAYS, walker.BATCH)
+    ]  # fmt: skip
+    mean = np.mean([lot[0] for lot in lots], axis=0)
+    covariance = np.mean([lot[1] for lot in lots], axis=0) / len(lots)
+    surface = surface_share(specimen)
+    return surface + (1.0 - surface) * mean, (1.0 - surface) ** 2 * covariance
+
+
+def _check(
+    surrogate: Surrogate, seed: int, checks: int, progress: bool
+) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """By form: modes and rest of the relative error, and its RMS in reflectance."""
+    from tqdm import tqdm
+
+    key = jax.random.fold_in(jax.random.key(seed), 1)
+    member = surrogate.at(surrogate.forms[0])
+    vector = state_vector(member.names, member.lower, member.upper)
+    drawn = vector.prior_draws(key, checks)  # the same for each form
+    found = {}
+    with (
+        tqdm(
+            total=checks * len(surrogate.forms), desc="check", unit="specimen", disable=not progress
+        ) as bar,
+        ThreadPoolExecutor(2) as pool,
+    ):
+        for number, form in enumerate(surrogate.forms):
+            member = surrogate.at(form)
+
+            def one(i: int, form: str = form, number: int = number):
+                own = jax.random.fold_in(jax.random.fold_in(key, i), number)
+                return fresh(surrogate, drawn[i], form, own)
+
+            relative, noise, absolute = [], [], []
+            for i, (truth, covariance) in enumerate(pool.map(one, range(checks))):
+                guess = np.asarray(member(jnp.asarray(drawn[i], jnp.float32)), float)
+                inside = np.abs(guess - float(member.surface)) + LEAST_INSIDE
+                relative.append((guess - truth) / inside)
+                noise.append(covariance / np.outer(inside, inside))
+                absolute.append((guess - truth) ** 2 - np.diag(covariance))
+                bar.update()
+            rms = np.sqrt(np.maximum(np.mean(absolute, axis=0), 1e-8))
+            found[form] = (*_error(np.array(relative), np.mean(noise, axis=0)), rms)
+    return found
 
 
 def _fit(x: np.ndarray, log: np.ndarray, seed: int) -> dict[str, np.ndarray]:
@@ -130,25 +201,16 @@ def _fit(x: np.ndarray, log: np.ndarray, seed: int) -> dict[str, np.ndarray]:
     return {name: np.asarray(value, float) for name, value in found.items()}
 
 
-def _predict(fitted: dict[str, np.ndarray], x: np.ndarray) -> np.ndarray:
-    y = np.broadcast_to((x - fitted["centre"]) / fitted["scale"], (ENSEMBLE, *x.shape))
-    depth = len(HIDDEN) + 1
-    for i in range(depth):
-        y = y @ fitted[f"weight{i}"] + fitted[f"bias{i}"][:, None]
-        y = np.tanh(y) if i < depth - 1 else y
-    return y.mean(axis=0) @ fitted["components"] + fitted["mean"]
+def _error(relative: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance of the relative error as `modes` (m, w) and a diagonal `rest` (w,).
 
-
-def _error(residual: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance of the surrogate's error as `modes` (m, w) and a diagonal `rest` (w,).
-
-    The residuals of held-out rows hold the Monte Carlo noise of the rows themselves, whose variance
-    is known and taken off; at least a tenth of what was seen remains, because what is taken off is
-    uncertain too.
+    The differences (n, w) hold the Monte Carlo error of the checks themselves, whose covariance
+    (w, w) is known and taken off. At least a tenth of the variance that was seen remains, because
+    what is taken off is uncertain too.
     """
-    seen = np.mean(residual**2, axis=0)
-    own = np.maximum(seen - np.mean(noise**2, axis=0), 0.1 * seen)
-    scaled = residual * np.sqrt(own / seen)
-    _, singular, directions = np.linalg.svd(scaled / np.sqrt(len(scaled)), full_matrices=False)
-    modes = singular[:MODES, None] * directions[:MODES]
-    return modes, np.maximum(own - np.sum(modes**2, axis=0), 1e-10)
+    second = relative.T @ relative / len(relative)
+    size, directions = np.linalg.eigh(second - noise)
+    kept = np.argsort(size)[::-1][:MODES]
+    modes = np.sqrt(np.maximum(size[kept], 0.0))[:, None] * directions[:, kept].T
+    own = np.maximum(np.diag(second - noise), 0.1 * np.diag(second))
+    return modes, np.maximum(own - np.sum(modes**2, axis=0), 0.02 * own)

@@ -446,7 +446,7 @@ def walk(
     `absorb` is the share of the absorption that ends rays on the way (the rest is in the weights;
     the answer does not depend on it). `independent` leaves out the rejection of particles that
     overlap the one before or cross a boundary. `incidence` in radians. The same key and numbers
-    give the same paths.
+    (`first`, `rays`) give the same paths.
     """
     medium = _medium(layers, form, absorb)
     bits = jax.random.bits(key, (2,), jnp.uint32)

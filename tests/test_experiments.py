@@ -125,7 +125,7 @@ def test_covariance_of_the_walk_has_the_mean_and_errors_of_the_tally():
     nm = np.array([450.0, 550.0, 560.0, 800.0])
     layers = Specimen().layers(nm)
     paths = walker.walk(layers, "complex", jax.random.key(4), rays=4096, absorb=recovery.ABSORB)
-    mean, covariance = recovery.mean_and_covariance(paths, layers)
+    mean, covariance = tally.moments(paths, layers, recovery.ABSORB)
     found = tally.collect(paths, layers, layers, recovery.ABSORB)
     np.testing.assert_allclose(mean, found.mean, rtol=1e-4)
     # by wavelength sent, the scatter is at most that of independent draws
@@ -159,7 +159,7 @@ def test_recovery_covers_what_was_simulated_with_the_fitting_model(cache, tmp_pa
     def simulated(truth, form, key):
         member = surrogate.at(form).on(nm)
         own = 1e-6 * np.eye(nm.size)
-        scatter = np.linalg.cholesky(np.asarray(member.error_covariance) + own)
+        scatter = np.linalg.cholesky(np.asarray(member.error_covariance(None)) + own)
         noise = scatter @ np.asarray(jax.random.normal(key, nm.shape), float)
         return np.asarray(member(truth), float) + noise, own
 

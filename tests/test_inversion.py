@@ -46,7 +46,7 @@ def population():
     forms = generator.integers(0, 2, len(truth))
     both = [reflectance(truth, WIDE, form) for form in TOY.forms]
     clean = np.where(forms[:, None] == 0, *both)
-    error = TOY.at("complex").on(WIDE).error_covariance
+    error = TOY.at("complex").on(WIDE).error_covariance(None)
     measured = np.stack(
         [
             generator.multivariate_normal(spectrum, noise_covariance(WIDE, spectrum) + error)
@@ -98,7 +98,7 @@ def test_a_fit_carries_all_that_it_promises():
     np.testing.assert_allclose(fit.covariance, fit.covariance.T, rtol=1e-9)
     assert np.all(np.linalg.eigvalsh(fit.z_covariance) > 0.0)
     assert np.all(np.linalg.eigvalsh(fit.z_covariance) < 1.0 + 1e-9)
-    error = TOY.at("complex").on(VISIBLE).error_covariance
+    error = TOY.at("complex").on(VISIBLE).error_covariance(None)
     np.testing.assert_allclose(fit.sd, np.sqrt(0.003**2 + np.diag(error)))
     np.testing.assert_allclose(fit.fitted, reflectance(fit.value, VISIBLE, fit.form)[0], atol=1e-9)
     assert sum(fit.form_probability.values()) == pytest.approx(1.0)

@@ -42,8 +42,7 @@ class ToyMember(eqx.Module):
     def surface(self):
         return 0.04
 
-    @property
-    def error_covariance(self):
+    def error_covariance(self, reflectance):
         distance = np.subtract.outer(*2 * (np.asarray(self.wavelength_nm),))
         return 0.003**2 * np.exp(-0.5 * (distance / 50.0) ** 2) + 1e-8 * np.eye(distance.shape[0])
 
