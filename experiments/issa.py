@@ -20,7 +20,7 @@ from experiments import _shared
 from hylios_fit.errors import HyliosError
 
 BLOCK = 500  # spectra between two checkpoints
-STARTS = 4
+STARTS = 1  # four find the same minima (median residual of 153 spectra: 0.0286 either way)
 BOOTSTRAP = 500
 QUANTITIES = ("melanin_mg_per_mL", "blood_percent", "oxygen_saturation", "water_percent")
 COLUMNS = ("residual_rms", "reduced_chi2", "delta_e", "seconds", *QUANTITIES)

@@ -26,12 +26,12 @@ from hylios_fit.surrogate import (
 )
 from hylios_fit.table import ABSORB, open_table, surface_share
 
-COMPONENTS = 12
+COMPONENTS = 24
 HIDDEN = (64, 64)
 ENSEMBLE = 3
 PENALTY = 0.003
 LEAST_ROWS = 64  # of each form
-CHECKS = 40  # fresh specimens of each form that measure the error
+CHECKS = 32  # fresh specimens of each form that measure the error
 CHECK_RAYS = 131_072
 MODES = 10
 
