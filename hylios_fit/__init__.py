@@ -13,9 +13,9 @@ Data flows one way through the modules; each imports only from those above it:
     analog       the paper's walk to the letter: one ray, one wavelength
     walker       the weighted walk: one set of paths for many wavelengths and contents
     tally        paths -> reflectance with its standard error
-    simulation   Specimen -> Curve, by any method
     table        design of parameters, simulation, storing, resuming
     surrogate    parameters -> spectrum; knows its range and its own error
+    simulation   Specimen -> Curve, by any method
     spectra      measured spectra: read, checked, written
     instrument   bands, specular in or out, noise
     statevector  free parameters: names, order, bounds, priors, transforms

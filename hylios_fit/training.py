@@ -33,7 +33,7 @@ PENALTY = 0.003
 LEAST_ROWS = 64  # of each form
 CHECKS = 32  # fresh specimens of each form that measure the error
 CHECK_RAYS = 131_072
-MODES = 10
+MODES = 24
 
 
 def train(
@@ -159,7 +159,10 @@ def _check(
                 absolute.append((guess - truth) ** 2 - np.diag(covariance))
                 bar.update()
             rms = np.sqrt(np.maximum(np.mean(absolute, axis=0), 1e-8))
-            found[form] = (*_error(np.array(relative), np.mean(noise, axis=0)), rms)
+            found[form] = (
+                *_error(np.array(relative), np.mean(noise, axis=0), len(member.names)),
+                rms,
+            )
     return found
 
 
@@ -201,16 +204,23 @@ def _fit(x: np.ndarray, log: np.ndarray, seed: int) -> dict[str, np.ndarray]:
     return {name: np.asarray(value, float) for name, value in found.items()}
 
 
-def _error(relative: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _error(
+    relative: np.ndarray, noise: np.ndarray, directions: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Covariance of the relative error as `modes` (m, w) and a diagonal `rest` (w,).
 
     The differences (n, w) hold the Monte Carlo error of the checks themselves, whose covariance
     (w, w) is known and taken off. At least a tenth of the variance that was seen remains, because
-    what is taken off is uncertain too.
+    what is taken off is uncertain too. The inverse of a covariance from n specimens is too sure of
+    itself by (n - 1)/(n - p - 2) (Hartlap et al. 2007, doi 10.1051/0004-6361:20066170), with p the
+    `directions` that a fit can move in: the covariance is widened by that.
     """
-    second = relative.T @ relative / len(relative)
-    size, directions = np.linalg.eigh(second - noise)
+    n = len(relative)
+    second = relative.T @ relative / n
+    size, vectors = np.linalg.eigh(second - noise)
     kept = np.argsort(size)[::-1][:MODES]
-    modes = np.sqrt(np.maximum(size[kept], 0.0))[:, None] * directions[:, kept].T
+    modes = np.sqrt(np.maximum(size[kept], 0.0))[:, None] * vectors[:, kept].T
     own = np.maximum(np.diag(second - noise), 0.1 * np.diag(second))
-    return modes, np.maximum(own - np.sum(modes**2, axis=0), 0.02 * own)
+    rest = np.maximum(own - np.sum(modes**2, axis=0), 0.02 * own)
+    widening = (n - 1) / max(n - directions - 2, 1)
+    return modes * np.sqrt(widening), rest * widening

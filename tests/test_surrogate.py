@@ -236,7 +236,7 @@ def test_the_error_has_the_noise_of_the_check_taken_off():
     own = rng.normal(size=(4000, 1)) * 0.01 * np.linspace(1, 2, 30)
     noise = np.diag(np.full(30, 0.02**2))
     seen = own + 0.02 * rng.normal(size=(4000, 30))
-    modes, rest = training._error(seen, noise)
+    modes, rest = training._error(seen, noise, 11)
     assert np.allclose(
         np.sum(modes**2, axis=0) + rest, (0.01 * np.linspace(1, 2, 30)) ** 2, rtol=0.4
     )
