@@ -124,23 +124,11 @@ def walked(
     truth: np.ndarray, form: str, names: tuple[str, ...], rays: int, key: jax.Array
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reflectance (B,) of a specimen by the walker, and the covariance (B, B) of its error."""
-    from hylios_fit import fresnel, tally, walker
+    from hylios_fit.simulation import with_covariance
     from hylios_fit.skin import Specimen
 
     specimen = Specimen(dict(zip(names, truth.tolist(), strict=True)), form, "drawn")
-    layers = specimen.layers(bands())
-    batch = min(walker.BATCH, rays)
-    lots = [
-        tally.moments(
-            walker.walk(layers, form, key, first=first, rays=batch, absorb=ABSORB), layers, ABSORB
-        )
-        for first in range(0, rays, batch)
-    ]
-    mean = np.mean([lot[0] for lot in lots], axis=0)
-    covariance = np.mean([lot[1] for lot in lots], axis=0) / len(lots)
-    angle = float(np.radians(8.0))
-    surface = fresnel.surface_reflectance(angle, 1.0, specimen.index_corneum, specimen.roughness)
-    return surface + (1.0 - surface) * mean, (1.0 - surface) ** 2 * covariance
+    return with_covariance(specimen, bands(), rays, key)
 
 
 def _fits(

@@ -77,6 +77,33 @@ def simulate(
     return run(specimen, nm, surface, rays, key, angle, tolerance, independent_particles, progress)
 
 
+def with_covariance(
+    specimen: Specimen, nm: np.ndarray, rays: int, key: jax.Array, incidence: float = 8.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Reflectance (w,) by the walker, and the covariance (w, w) of its error between wavelengths.
+
+    Wavelengths share paths, and so errors; `simulate` states their standard errors alone.
+    `incidence` in degrees.
+    """
+    layers = specimen.layers(nm)
+    angle = math.radians(incidence)
+    batch = min(walker.BATCH, rays)
+    lots = [
+        tally.moments(
+            walker.walk(
+                layers, specimen.melanosome_form, key,
+                incidence=angle, first=first, rays=batch, absorb=ABSORB,
+            ),
+            layers, ABSORB,
+        )
+        for first in range(0, rays, batch)
+    ]  # fmt: skip
+    mean = np.mean([lot[0] for lot in lots], axis=0)
+    covariance = np.mean([lot[1] for lot in lots], axis=0) / len(lots)
+    surface = fresnel.surface_reflectance(angle, 1.0, specimen.index_corneum, specimen.roughness)
+    return surface + (1.0 - surface) * mean, (1.0 - surface) ** 2 * covariance
+
+
 def _check(
     nm: np.ndarray, method: str, rays: int, incidence: float, tolerance: float | None
 ) -> None:

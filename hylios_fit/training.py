@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hylios_fit import tally, walker
 from hylios_fit.errors import HyliosError
+from hylios_fit.simulation import with_covariance
 from hylios_fit.skin import Specimen
 from hylios_fit.statevector import state_vector
 from hylios_fit.surrogate import (
@@ -24,7 +24,7 @@ from hylios_fit.surrogate import (
     load_surrogate,
     save,
 )
-from hylios_fit.table import ABSORB, open_table, surface_share
+from hylios_fit.table import open_table
 
 COMPONENTS = 24
 HIDDEN = (64, 64)
@@ -109,21 +109,9 @@ def fresh(
     """Reflectance (w,) of one specimen by the walker, and the covariance (w, w) of its error."""
     names = surrogate.at(form).names
     specimen = Specimen(dict(zip(names, parameters.tolist(), strict=True)), form, "drawn")
-    layers = specimen.layers(surrogate.wavelength_nm)
-    lots = [
-        tally.moments(
-            walker.walk(
-                layers, form, key, first=first, rays=walker.BATCH,
-                incidence=np.radians(surrogate.incidence_deg), absorb=ABSORB,
-            ),
-            layers, ABSORB,
-        )
-        for first in range(0, CHECK_RAYS, walker.BATCH)
-    ]  # fmt: skip
-    mean = np.mean([lot[0] for lot in lots], axis=0)
-    covariance = np.mean([lot[1] for lot in lots], axis=0) / len(lots)
-    surface = surface_share(specimen)
-    return surface + (1.0 - surface) * mean, (1.0 - surface) ** 2 * covariance
+    return with_covariance(
+        specimen, surrogate.wavelength_nm, CHECK_RAYS, key, surrogate.incidence_deg
+    )
 
 
 def _check(
