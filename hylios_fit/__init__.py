@@ -10,12 +10,17 @@ Data flows one way through the modules; each imports only from those above it:
     scattering   each scattering law: its density and its sampler
     melanosome   one particle or complex: attenuation, share absorbed per hit
     skin         Specimen (parameters, presets) -> coefficients by layer and wavelength
+    tissue       plain layers with Henyey-Greenstein scattering, and their own fast walk
     analog       the paper's walk to the letter: one ray, one wavelength
     walker       the weighted walk: one set of paths for many wavelengths and contents
     tally        paths -> reflectance with its standard error
+    streams      directions of the deterministic solver, and what interfaces do to them
+    adding       layers -> reflectance by adding and doubling, without noise
     table        design of parameters, simulation, storing, resuming
     surrogate    parameters -> spectrum; knows its range and its own error
     simulation   Specimen -> Curve, by any method
+    exits        Specimen -> BRDF and BSSRDF: where and in which direction light leaves
+    sensitivity  how much each material matters: the mean sensitivity index
     spectra      measured spectra: read, checked, written
     instrument   bands, specular in or out, noise
     statevector  free parameters: names, order, bounds, priors, transforms
@@ -42,8 +47,15 @@ _MODULE_OF = {
     "HyliosError": "errors",
     "wavelengths": "units",
     "Specimen": "skin",
+    "Tissue": "tissue",
     "Curve": "simulation",
     "simulate": "simulation",
+    "Brdf": "exits",
+    "simulate_brdf": "exits",
+    "Bssrdf": "exits",
+    "simulate_bssrdf": "exits",
+    "Sensitivity": "sensitivity",
+    "sensitivity": "sensitivity",
     "Surrogate": "surrogate",
     "load_surrogate": "surrogate",
     "Spectra": "spectra",

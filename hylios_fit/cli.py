@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from hylios_fit.spectra import Spectra
     from hylios_fit.surrogate import Surrogate
 
-METHODS = ("walker", "analog", "surrogate")
+METHODS = ("walker", "analog", "adding", "surrogate")
 SIMULATION_HEADER = ("wavelength_nm", "reflectance", "standard_error", "surface", "subsurface")
+SENSITIVITY_HEADER = ("material", "domain", "msi")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -83,6 +84,13 @@ def _parser() -> argparse.ArgumentParser:
     _specimen(simulate)
     simulate.add_argument("--method", choices=METHODS, default="walker")
     simulate.add_argument(
+        "--output",
+        dest="quantity",
+        choices=("reflectance", "brdf", "bssrdf"),
+        default="reflectance",
+        help="brdf: by direction; bssrdf: by distance (walker only); default: reflectance",
+    )
+    simulate.add_argument(
         "--incidence", type=float, default=8.0, metavar="DEG", help="from the normal; default: 8"
     )
     simulate.add_argument("--rays", type=_count, metavar="N", help="rays for each wavelength")
@@ -105,11 +113,34 @@ def _parser() -> argparse.ArgumentParser:
     optics = command("optics", _optics, "the coefficients that the transport sees")
     _specimen(optics)
 
+    sensitivity = command(
+        "sensitivity", _sensitivity, "mean sensitivity index of each material, by domain"
+    )
+    _specimen(sensitivity, wavelengths=False)
+    sensitivity.add_argument("--method", choices=METHODS, default="adding")
+    sensitivity.add_argument(
+        "--incidence", type=float, default=8.0, metavar="DEG", help="from the normal; default: 8"
+    )
+    sensitivity.add_argument("--rays", type=_count, metavar="N", help="rays of a walk")
+    sensitivity.add_argument(
+        "--counted",
+        type=_count,
+        metavar="N",
+        help="the index that curves of N counted rays would show; the paper's are of 100000",
+    )
+    _seed(sensitivity)
+
     table = command("table", _table, "simulate a training table")
     table.add_argument("-o", dest="output", metavar="TABLE", required=True)
-    table.add_argument("--rows", type=_count, metavar="N", help="specimens in the table")
+    table.add_argument("--rows", type=_count, metavar="N", help="specimens in the whole table")
     table.add_argument(
-        "--resume", action="store_true", help="go on with a table that was interrupted"
+        "--resume",
+        action="store_true",
+        help="go on with a table, or append --rows; several processes may do so at once",
+    )
+    table.add_argument("--generator", choices=("walker", "adding"), default="walker")
+    table.add_argument(
+        "--dask", metavar="ADDRESS", help="of a Dask scheduler whose workers share the folder"
     )
     _seed(table)
 
@@ -151,15 +182,16 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _specimen(parser: argparse.ArgumentParser) -> None:
+def _specimen(parser: argparse.ArgumentParser, wavelengths: bool = True) -> None:
     parser.add_argument("specimen", metavar="SPECIMEN", help="S1 to S4, or a TOML file")
     parser.add_argument("-o", dest="output", metavar="FILE.csv", required=True)
-    parser.add_argument(
-        "--wavelengths",
-        default="250:2500:5",
-        metavar="LOW:HIGH:STEP",
-        help="nm, or a list such as 450,550,650; default: 250:2500:5",
-    )
+    if wavelengths:
+        parser.add_argument(
+            "--wavelengths",
+            default="250:2500:5",
+            metavar="LOW:HIGH:STEP",
+            help="nm, or a list such as 450,550,650; default: 250:2500:5",
+        )
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="repeatable"
     )
@@ -207,6 +239,8 @@ def _simulate(args: argparse.Namespace) -> int:
     from hylios_fit.spectra import write_csv
 
     options = {} if args.rays is None else {"rays": args.rays}
+    if args.quantity != "reflectance":
+        return _simulate_exits(args, output, specimen, wavelengths, options)
     curve = simulate(
         specimen,
         wavelengths,
@@ -228,6 +262,31 @@ def _simulate(args: argparse.Namespace) -> int:
     return _wrote(output)
 
 
+def _simulate_exits(
+    args: argparse.Namespace, output: Path, specimen: Any, wavelengths: Any, options: dict[str, Any]
+) -> int:
+    if args.method != "walker" or args.tolerance is not None:
+        raise HyliosError(f"--output {args.quantity}: only by --method walker, without --tolerance")
+    import jax
+
+    from hylios_fit import exits
+    from hylios_fit.spectra import write_csv
+
+    run = exits.simulate_brdf if args.quantity == "brdf" else exits.simulate_bssrdf
+    found = run(
+        specimen,
+        wavelengths,
+        key=jax.random.key(args.seed),
+        incidence=args.incidence,
+        smooth_surface=args.smooth_surface,
+        independent_particles=args.independent_particles,
+        progress=True,
+        **options,
+    )
+    write_csv(output, *found.rows())
+    return _wrote(output)
+
+
 def _optics(args: argparse.Namespace) -> int:
     output = _output_file(args.output)
     specimen, wavelengths = _read_specimen(args)
@@ -239,14 +298,39 @@ def _optics(args: argparse.Namespace) -> int:
     return _wrote(output)
 
 
+def _sensitivity(args: argparse.Namespace) -> int:
+    output = _output_file(args.output)
+    specimen = _set_specimen(args)
+    import jax
+
+    from hylios_fit.sensitivity import sensitivity
+    from hylios_fit.spectra import write_csv
+
+    found = sensitivity(
+        specimen,
+        method=args.method,
+        key=jax.random.key(args.seed),
+        incidence=args.incidence,
+        progress=True,
+        **({} if args.rays is None else {"rays": args.rays}),
+    )
+    rows = [(material, domain, f"{msi:.4g}") for material, domain, msi in found.rows(args.counted)]
+    write_csv(output, SENSITIVITY_HEADER, rows)
+    return _wrote(output)
+
+
 def _read_specimen(args: argparse.Namespace) -> tuple[Any, Any]:
     wavelengths = parse_wavelengths(args.wavelengths)
+    return _set_specimen(args), wavelengths
+
+
+def _set_specimen(args: argparse.Namespace) -> Any:
     from hylios_fit.skin import load_specimen, parse_setting
 
     specimen = load_specimen(args.specimen)
     for text in args.set:
         specimen = parse_setting(specimen, text)
-    return specimen, wavelengths
+    return specimen
 
 
 def parse_wavelengths(text: str) -> Any:
@@ -280,8 +364,24 @@ def _table(args: argparse.Namespace) -> int:
     output = _output_path(args.output)
     from hylios_fit import table
 
-    options = {} if args.rows is None else {"rows": args.rows}
-    table.generate(output, seed=args.seed, resume=args.resume, progress=True, **options)
+    executor = None
+    if args.dask is not None:
+        try:
+            from dask.distributed import Client
+        except ImportError:
+            raise HyliosError("--dask needs Dask: pip install hylios_fit[dask]") from None
+        try:
+            executor = Client(args.dask, timeout=10).get_executor()
+        except (OSError, ValueError) as error:
+            raise HyliosError(f"--dask {args.dask}: {error}") from None
+    table.generate(
+        output,
+        rows=args.rows,
+        seed=args.seed,
+        resume=args.resume,
+        generator=args.generator,
+        executor=executor,
+    )
     return _wrote(output)
 
 

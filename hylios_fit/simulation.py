@@ -9,12 +9,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from hylios_fit import analog, fresnel, skin, tally, walker
+from hylios_fit import adding, analog, fresnel, skin, tally, walker
 from hylios_fit.errors import HyliosError
 from hylios_fit.skin import Specimen
 from hylios_fit.units import WAVELENGTH_MAX, WAVELENGTH_MIN
 
-METHODS = ("walker", "analog", "surrogate")
+METHODS = ("walker", "analog", "adding", "surrogate")
 MOST_RAYS = 20_000_000  # where a tolerance stops asking for more
 ANALOG_BATCH = 4096
 ABSORB = 0.5  # see `walker.walk`: the answer does not depend on it, the cost does
@@ -56,16 +56,20 @@ def simulate(
     """Reflectance of `specimen` at `wavelengths` (nm, 250 to 2500) and `incidence` (degrees).
 
     `walker` spreads `rays` over all wavelengths and shares their paths; `analog` sends `rays` rays
-    at each wavelength; `surrogate` asks the embedded one (8 degrees, its own training range).
+    at each wavelength; `adding` solves without noise (its `standard_error` is what the next lower
+    order differs by, and the rejection of particles is a mean over rays, `skin.let_stand`);
+    `surrogate` asks the embedded one (8 degrees, its own training range).
     With `tolerance`, rays are added until every standard error is below it, up to `MOST_RAYS`;
     `note` says so if that was not enough. Both walks need a `key` (`jax.random.key(seed)`).
     """
     nm = np.atleast_1d(np.asarray(wavelengths, float))
-    _check(nm, method, rays, incidence, tolerance)
+    check_request(nm, method, rays, incidence, tolerance)
     if smooth_surface:
         specimen = specimen.replace(roughness=0.0)
     if method == "surrogate":
         return _surrogate(specimen, nm, incidence, independent_particles)
+    if method == "adding":
+        return _added(specimen, nm, math.radians(incidence), tolerance, independent_particles)
     if key is None:
         raise HyliosError(f"method {method!r} draws random numbers: give key=jax.random.key(seed)")
     index = np.asarray(specimen.layers(nm).index)
@@ -104,7 +108,7 @@ def with_covariance(
     return surface + (1.0 - surface) * mean, (1.0 - surface) ** 2 * covariance
 
 
-def _check(
+def check_request(
     nm: np.ndarray, method: str, rays: int, incidence: float, tolerance: float | None
 ) -> None:
     if method not in METHODS:
@@ -129,24 +133,29 @@ def _walked(specimen, nm, surface, rays, key, angle, tolerance, independent, pro
     medium = specimen.layers(nm)
     # a refractive index that depends on the wavelength bends every path its own way
     own_only = specimen.index_dispersion != 0
+    plan = walker.own_plan(medium, ABSORB) if own_only else walker.plan(medium)
     batch = min(walker.BATCH, rays) if tolerance is None else walker.BATCH
     total = None
     sent = 0
     error = np.full(nm.shape, np.inf)
-    with _bar(rays if tolerance is None else None, progress) as bar:
+    paths = None
+    with progress_bar(rays if tolerance is None else None, progress) as bar:
         while sent < rays if tolerance is None else np.max(error) > tolerance and sent < MOST_RAYS:
+            if paths is not None and sent == batch and not own_only:
+                plan = tally.improve(paths, plan, medium)
             paths = walker.walk(
-                medium,
+                plan.layers,
                 specimen.melanosome_form,
                 key,
                 incidence=angle,
                 first=sent,
                 rays=batch,
-                absorb=ABSORB,
                 independent=independent,
+                shares=plan.shares,
             )
             total = tally.add(
-                total, tally.collect(paths, medium, medium, ABSORB, own_only=own_only)
+                total,
+                tally.collect(paths, plan.layers, medium, own_only=own_only, shares=plan.shares),
             )
             sent += batch
             error = (1.0 - surface) * np.asarray(total.standard_error, float)
@@ -164,7 +173,7 @@ def _traced(specimen, nm, surface, rays, key, angle, tolerance, independent, pro
     melanin = skin.melanin_coefficient(specimen.values, nm)
     inside, at_once, sent = np.zeros(nm.shape), np.zeros(nm.shape), np.zeros(nm.shape, int)
     batch = min(ANALOG_BATCH, rays)
-    with _bar(rays * len(nm) if tolerance is None else None, progress) as bar:
+    with progress_bar(rays * len(nm) if tolerance is None else None, progress) as bar:
         for i in range(len(nm)):
             error = math.inf
             while sent[i] < rays if tolerance is None else error > tolerance and sent[i] < 10**7:
@@ -187,6 +196,32 @@ def _traced(specimen, nm, surface, rays, key, angle, tolerance, independent, pro
     )  # fmt: skip
 
 
+def _added(specimen, nm, angle, tolerance, independent) -> Curve:
+    medium = specimen.layers(nm)
+    if not independent:
+        medium = skin.let_stand(medium, specimen.values, specimen.melanosome_form)
+    orders = adding.ORDERS[adding.ORDERS.index(adding.ORDER) - 1 :]
+    error = np.full(nm.shape, np.inf)
+    before = None
+    for order in orders[:2] if tolerance is None else orders:
+        found = adding.skin(medium, incidence=angle, order=order)
+        reflectance, surface, inside = (np.asarray(part, float) for part in found[:3])
+        if before is not None:
+            error = np.abs(reflectance - before)
+            if tolerance is None or np.max(error) <= tolerance:
+                break
+        before = reflectance
+    note = ""
+    if tolerance is not None and np.max(error) > tolerance:
+        note = (
+            f"the tolerance {tolerance:g} was not reached at order {orders[-1]}: the last step "
+            f"changed the reflectance by {np.max(error):.2g}"
+        )
+    return Curve(
+        nm, reflectance, error, surface, inside, "adding", 0, np.full(nm.shape, np.nan), note
+    )
+
+
 def _short(error: np.ndarray, tolerance: float | None, sent: int) -> str:
     if tolerance is None or np.max(error) <= tolerance:
         return ""
@@ -196,7 +231,7 @@ def _short(error: np.ndarray, tolerance: float | None, sent: int) -> str:
     )
 
 
-def _bar(total: int | None, progress: bool) -> Any:
+def progress_bar(total: int | None, progress: bool) -> Any:
     from tqdm import tqdm
 
     return tqdm(total=total, unit="ray", unit_scale=True, disable=not progress, delay=2)

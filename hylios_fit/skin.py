@@ -319,6 +319,24 @@ def layers(
     )
 
 
+def let_stand(layers: Layers, values: Mapping[str, Any], form: str) -> Layers:
+    """`layers` with as many particles as the walks let stand (`melanosome.accepted_share`)."""
+    dtype = layers.mu_particle.dtype
+    share = jnp.stack(
+        [
+            melanosome.accepted_share(
+                form,
+                melanosome.SHRINKING[stratum],
+                jnp.asarray(values[f"melanosome_{stratum}"], dtype) / 100,
+                jnp.asarray(values[f"thickness_{stratum}"], dtype),
+            )
+            for stratum in STRATA
+        ]
+    )
+    there = jnp.ones(len(LAYERS), dtype).at[1:4].set(share)
+    return layers._replace(mu_particle=layers.mu_particle * there[:, None])
+
+
 def optics_rows(
     specimen: Specimen, wavelength_nm: np.ndarray
 ) -> tuple[tuple[str, ...], list[tuple[Any, ...]]]:

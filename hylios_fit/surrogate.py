@@ -8,16 +8,19 @@ specimens that it never saw. Its file is a plain .npz without pickle.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import io
 import itertools
 import json
 import zipfile
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -45,6 +48,8 @@ OFFSETS = {
 }
 LEAST_INSIDE = 0.002  # reflectance, below which the relative error is not taken
 SLACK = 1e-5  # of the box's width, for rounding
+BLOCK = 4096  # rows of a batch of more than four blocks: what they need stays in the cache
+PRECISION = "highest"  # some accelerators multiply float32 with 10 bits unless told not to
 
 
 def features(names: tuple[str, ...], parameters: Float[Array, "... p"]) -> Float[Array, "... p"]:
@@ -65,6 +70,7 @@ class Member(eqx.Module):
 
     names: tuple[str, ...] = eqx.field(static=True)
     form: str = eqx.field(static=True)
+    projected: bool = eqx.field(static=True)  # on an instrument's bands
     lower: Float[Array, "p"]
     upper: Float[Array, "p"]
     centre: Float[Array, "p"]
@@ -74,14 +80,18 @@ class Member(eqx.Module):
     components: Float[Array, "k c"]
     mean: Float[Array, "c"]
     surface: Float[Array, ""]
-    wavelength_nm: np.ndarray
-    low: np.ndarray  # columns between which each band lies, and the share of the upper one
-    high: np.ndarray
-    part: Float[Array, "b"]
+    wavelength_nm: np.ndarray  # of the bands
+    readout: Float[Array, "c b"] | None  # bands from the wavelengths; None: they are the bands
     modes: Float[Array, "m b"]  # relative error: modes.T @ modes + diag(rest)
     rest: Float[Array, "b"]
 
     def __call__(self, parameters: Float[Array, "... p"]) -> Float[Array, "... b"]:
+        """Compiled when first called with numbers; traced, it is part of what is traced."""
+        if _traced((self, parameters)):
+            return self._evaluate(parameters)
+        return _compiled(self)(_array(parameters, self.centre.dtype))
+
+    def _evaluate(self, parameters: Float[Array, "... p"]) -> Float[Array, "... b"]:
         p = jnp.asarray(parameters, self.centre.dtype)
         like = (1,) * (p.ndim - 1) + (-1,)
         slack = SLACK * (self.upper - self.lower)
@@ -94,18 +104,16 @@ class Member(eqx.Module):
         x = (features(self.names, bounded) - self.centre.reshape(like)) / self.scale.reshape(like)
         x = jnp.broadcast_to(x, (self.weights[0].shape[0], *x.shape))
         for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = jnp.einsum("e...i,eio->e...o", x, w)
+            x = jnp.einsum("e...i,eio->e...o", x, w, precision=PRECISION)
             x = x + b.reshape(b.shape[0], *(1,) * (p.ndim - 1), b.shape[1])
             if i < len(self.weights) - 1:
                 x = jnp.tanh(x)
         scores = jnp.mean(x, axis=0)
-        log = scores @ self.components + self.mean.reshape(like)
-        spectrum = self.surface + (1.0 - self.surface) * (jnp.exp(log) - FLOOR)
-        part = self.part.reshape(like)
-        below, above = (
-            jnp.take(spectrum, at, axis=-1, mode="clip") for at in (self.low, self.high)
-        )
-        bands = (1.0 - part) * below + part * above
+        log = jnp.matmul(scores, self.components, precision=PRECISION) + self.mean.reshape(like)
+        bands = jnp.exp(log) - FLOOR
+        if self.readout is not None:
+            bands = jnp.matmul(bands, self.readout, precision=PRECISION)
+        bands = self.surface + (1.0 - self.surface) * bands
         return jnp.where(inside, bands, jnp.nan)
 
     # arrays have no hash, and jax.jit wants one of what it compiles
@@ -123,47 +131,81 @@ class Member(eqx.Module):
         inside = np.abs(np.asarray(reflectance, float) - float(self.surface)) + LEAST_INSIDE
         return inside[:, None] * relative * inside
 
-    def on(self, wavelength_nm: Any) -> Member:
-        """This member at an instrument's bands: linear between its wavelengths, projected once."""
-        bands = np.atleast_1d(np.asarray(wavelength_nm, float))
+    def on(self, wavelength_nm: Any, response: Any = None) -> Member:
+        """This member at an instrument's bands, projected once so that nothing else is computed.
+
+        Args:
+            wavelength_nm: narrow bands (B,), nm, in any order: the reflectance there, linear
+                between the surrogate's wavelengths. With `response`, where that was sampled.
+            response: wide bands, (B, N) at N rising wavelengths: sensitivity times illuminant, in
+                any unit, linear between its samples and 0 outside them. A band is the mean
+                reflectance weighted by it: 1 for what reflects all light.
+
+        Raises:
+            HyliosError: bands or responses outside the surrogate's wavelengths, or malformed.
+        """
         grid = np.asarray(self.wavelength_nm)
-        if bands.min() < grid[0] or bands.max() > grid[-1]:
+        at = np.atleast_1d(np.asarray(wavelength_nm, float))
+        narrow = _linear(grid, at)
+        if response is None:
+            return self.onto(narrow, at)
+        wide = np.atleast_2d(np.asarray(response, float))
+        if wide.ndim != 2 or wide.shape[1] != at.size or at.size < 2 or (np.diff(at) <= 0).any():
             raise HyliosError(
-                f"the surrogate covers {grid[0]:g} to {grid[-1]:g} nm, "
-                f"asked for {bands.min():g} to {bands.max():g} nm"
+                f"response: expected shape (bands, {at.size}) at rising wavelengths, "
+                f"got {wide.shape} at {at.size} wavelengths"
             )
-        low = np.clip(np.searchsorted(grid, bands, side="right") - 1, 0, len(grid) - 2)
-        part = (bands - grid[low]) / (grid[low + 1] - grid[low])
-        columns, place = np.unique(np.concatenate([low, low + 1]), return_inverse=True)
-        if not np.array_equal(self.low, np.arange(len(grid))):
+        # the product of two broken lines, by Simpson's rule between all their corners: exact
+        corners = np.union1d(at, grid[(grid > at[0]) & (grid < at[-1])])
+        fine = np.union1d(corners, 0.5 * (corners[1:] + corners[:-1]))
+        simpson = np.zeros(fine.size)
+        for first, factor in ((0, 1.0), (1, 4.0), (2, 1.0)):
+            simpson[first : first + fine.size - 2 : 2] += factor * np.diff(corners) / 6.0
+        sampled = np.stack([np.interp(fine, at, row) for row in wide])
+        return self.onto(sampled * simpson @ _linear(grid, fine))
+
+    def onto(self, weights: Any, wavelength_nm: Any = None) -> Member:
+        """This member at bands that are weighted means of its wavelengths.
+
+        Args:
+            weights: (B, W), not negative; each row is divided by its sum.
+            wavelength_nm: what to call the bands, (B,); their centres of weight, if None.
+        """
+        grid = np.asarray(self.wavelength_nm)
+        w = np.asarray(weights, float)
+        if self.projected:
             raise HyliosError("project the surrogate itself, not one that is on bands already")
+        if w.ndim != 2 or w.shape[1] != len(grid):
+            raise HyliosError(f"weights: expected shape (bands, {len(grid)}), got {w.shape}")
+        if not (np.isfinite(w).all() and (w >= 0).all() and (w.sum(axis=1) > 0).all()):
+            raise HyliosError("weights: expected finite, none below 0, and one above 0 in each row")
+        w = w / w.sum(axis=1, keepdims=True)
+        used = np.flatnonzero(w.any(axis=0))
+        readout = w[:, used].T
         dtype = self.mean.dtype
-        rest = np.asarray(self.rest, float)
-        modes = np.asarray(self.modes, float)
-        return eqx.tree_at(
-            lambda m: (
-                m.components, m.mean, m.wavelength_nm, m.low, m.high, m.part, m.modes, m.rest
-            ),
+        # relative errors add up by the light that each wavelength brings
+        share = w * np.exp(np.asarray(self.mean, float))
+        share = (share / share.sum(axis=1, keepdims=True)).T
+        return dataclasses.replace(
             self,
-            (
-                self.components[:, columns],
-                self.mean[columns],
-                bands,
-                place[: len(bands)].astype(np.int32),
-                place[len(bands) :].astype(np.int32),
-                jnp.asarray(part, dtype),
-                jnp.asarray((1 - part) * modes[:, low] + part * modes[:, low + 1], dtype),
-                # not averaged down: neighbouring wavelengths err together
-                jnp.asarray((1 - part) * rest[low] + part * rest[low + 1], dtype),
-            ),
-        )  # fmt: skip
+            projected=True,
+            components=self.components[:, used],
+            mean=self.mean[used],
+            wavelength_nm=w @ grid if wavelength_nm is None else np.asarray(wavelength_nm, float),
+            readout=None
+            if np.array_equal(readout, np.eye(len(used)))
+            else jnp.asarray(readout, dtype),
+            modes=jnp.asarray(np.asarray(self.modes, float) @ share, dtype),
+            # not averaged down: neighbouring wavelengths err together
+            rest=jnp.asarray(np.asarray(self.rest, float) @ share, dtype),
+        )
 
 
 class Surrogate(eqx.Module):
     """Both members. The last parameter is `melanosome_form`: 0 complex, 1 dispersed.
 
-    Outside the training box a call raises `HyliosError` with names and ranges; under jit or vmap,
-    where it cannot, it returns NaN.
+    A call with numbers compiles when the first of their shape come, and raises `HyliosError` with
+    names and ranges outside the training box; under jit or vmap, where it cannot, it returns NaN.
     """
 
     members: dict[str, Member]
@@ -196,31 +238,51 @@ class Surrogate(eqx.Module):
             )
         return self.members[form]
 
+    def on(self, wavelength_nm: Any, response: Any = None) -> Surrogate:
+        """This surrogate at an instrument's bands (see `Member.on`)."""
+        on = {form: member.on(wavelength_nm, response) for form, member in self.members.items()}
+        return Surrogate(on, self.about)
+
     def __call__(self, parameters: Float[Array, "... q"]) -> Float[Array, "... w"]:
+        if _traced((self, parameters)):
+            return self._evaluate(parameters)
+        ready = _ready(self)
+        p = np.asarray(parameters)
+        given = _array(parameters, ready.dtype)
+        if p.shape[-1:] == (ready.count,):
+            for least, most, one in ready.forms:
+                if ((p >= least) & (p <= most)).all():  # of one form, as most are: half the work
+                    return one(given)
+        self.check(p)
+        return ready.mixed(given)
+
+    def _evaluate(self, parameters: Float[Array, "... q"]) -> Float[Array, "... w"]:
         p = jnp.asarray(parameters)
-        if not isinstance(p, Tracer):
-            self.check(np.asarray(parameters, float))
         form = p[..., -1:]
-        first, second = (member(p[..., :-1]) for member in self.members.values())
-        return jnp.where(form == 0, first, jnp.where(form == 1, second, jnp.nan))
+        found: Any = jnp.nan
+        for number, member in enumerate(self.members.values()):
+            found = jnp.where(form == number, member(p[..., :-1]), found)
+        return found
 
     def check(self, parameters: np.ndarray) -> None:
         """Raise `HyliosError` naming every parameter outside the training range."""
-        p = np.atleast_2d(parameters)
-        if p.shape[-1] != len(self.names):
+        p = np.asarray(parameters)
+        if p.ndim == 0 or p.shape[-1] != len(self.names):
             raise HyliosError(
                 f"expected {len(self.names)} parameters ({', '.join(self.names)}), "
-                f"got {p.shape[-1]}"
+                f"got {p.shape[-1] if p.ndim else 1}"
             )
+        p = np.atleast_2d(p)
+        (least, most, _), *_ = _ready(self).forms
         member = self.at(self.forms[0])
-        lower, upper = np.asarray(member.lower, float), np.asarray(member.upper, float)
-        slack = SLACK * (upper - lower)
         wrong = []
-        for i, name in enumerate(member.names):
-            bad = ~((p[..., i] >= lower[i] - slack[i]) & (p[..., i] <= upper[i] + slack[i]))
+        for i, (name, low, high) in enumerate(
+            zip(member.names, np.asarray(member.lower), np.asarray(member.upper), strict=True)
+        ):
+            x = p[..., i]
+            bad = ~((x >= least[i]) & (x <= most[i]))
             if bad.any():
-                value = p[..., i][bad].flat[0]
-                wrong.append(f"{name} = {value:g} (trained on {lower[i]:g} to {upper[i]:g})")
+                wrong.append(f"{name} = {x[bad].flat[0]:g} (trained on {low:g} to {high:g})")
         if not np.isin(p[..., -1], range(len(self.forms))).all():
             wrong.append(
                 "melanosome_form (0 complex, 1 dispersed; it was not trained on "
@@ -241,8 +303,72 @@ class Surrogate(eqx.Module):
             raise HyliosError("the surrogate was not trained on " + "; ".join(unknown))
         parameters = specimen.parameters(self.names)
         self.check(parameters)
-        member = self.at(specimen.melanosome_form).on(wavelength_nm)
-        return np.asarray(member(jnp.asarray(parameters[:-1], jnp.float32)), float)
+        member = self.at(specimen.melanosome_form)
+        if member.projected:
+            raise HyliosError("ask the surrogate itself, not one that is on bands already")
+        bands = np.atleast_1d(np.asarray(wavelength_nm, float))
+        weights = _linear(np.asarray(member.wavelength_nm), bands)
+        # the whole spectrum, because that is compiled once for all bands
+        return weights @ np.asarray(member(jnp.asarray(parameters[:-1], jnp.float32)), float)
+
+
+def _linear(grid: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """(B, W): linear interpolation from the grid to each wavelength."""
+    if at.ndim != 1 or not at.size or not np.isfinite(at).all():
+        raise HyliosError(f"bands: expected a list of wavelengths in nm, got shape {at.shape}")
+    if at.min() < grid[0] or at.max() > grid[-1]:
+        raise HyliosError(
+            f"the surrogate covers {grid[0]:g} to {grid[-1]:g} nm, "
+            f"asked for {at.min():g} to {at.max():g} nm"
+        )
+    low = np.clip(np.searchsorted(grid, at, side="right") - 1, 0, len(grid) - 2)
+    part = (at - grid[low]) / (grid[low + 1] - grid[low])
+    weights = np.zeros((len(at), len(grid)))
+    rows = np.arange(len(at))
+    weights[rows, low] = 1.0 - part
+    weights[rows, low + 1] = part
+    return weights
+
+
+def _array(numbers: Any, dtype: Any) -> Any:
+    return numbers if isinstance(numbers, Array) else np.asarray(numbers, dtype)
+
+
+def _traced(tree: Any) -> bool:
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+@lru_cache(maxsize=32)
+def _compiled(member: Member) -> Callable[[Any], Array]:
+    return jax.jit(lambda p: _in_blocks(member._evaluate, p))
+
+
+def _in_blocks(function: Callable[[Any], Array], rows: Any) -> Array:
+    if rows.ndim != 2 or len(rows) <= 4 * BLOCK:
+        return function(rows)
+    return jax.lax.map(function, rows, batch_size=BLOCK)
+
+
+class _Ready(NamedTuple):
+    """What each call of a surrogate would do again."""
+
+    count: int  # of parameters
+    dtype: Any
+    forms: tuple[tuple[np.ndarray, np.ndarray, Callable[[Any], Array]], ...]  # box, compiled
+    mixed: Callable[[Any], Array]
+
+
+@lru_cache(maxsize=32)
+def _ready(surrogate: Surrogate) -> _Ready:
+    forms = []
+    for number, member in enumerate(surrogate.members.values()):
+        lower, upper = np.asarray(member.lower, float), np.asarray(member.upper, float)
+        slack = SLACK * (upper - lower)
+        one = jax.jit(lambda p, m=member: _in_blocks(m._evaluate, p[..., :-1]))
+        forms.append((np.append(lower - slack, number), np.append(upper + slack, number), one))
+    mixed = jax.jit(lambda p: _in_blocks(surrogate._evaluate, p))
+    dtype = surrogate.at(surrogate.forms[0]).centre.dtype
+    return _Ready(len(surrogate.names), dtype, tuple(forms), mixed)
 
 
 # --- the file ---------------------------------------------------------------------------------
@@ -331,11 +457,10 @@ def _member(form: str, arrays: dict[str, np.ndarray], about: dict[str, Any]) -> 
         return jnp.asarray(arrays[f"{form}/{name}"], jnp.float32)
 
     depth = int(about["depth"])
-    w = len(arrays["wavelength_nm"])
-    everywhere = np.arange(w, dtype=np.int32)  # of one width, with and without JAX's x64
     return Member(
         names=tuple(about["names"]),
         form=form,
+        projected=False,
         lower=jnp.asarray(arrays["lower"], jnp.float32),
         upper=jnp.asarray(arrays["upper"], jnp.float32),
         centre=get("centre"),
@@ -346,9 +471,7 @@ def _member(form: str, arrays: dict[str, np.ndarray], about: dict[str, Any]) -> 
         mean=get("mean"),
         surface=jnp.asarray(about["surface"], jnp.float32),
         wavelength_nm=arrays["wavelength_nm"].astype(float),
-        low=everywhere,
-        high=everywhere,
-        part=jnp.zeros(w, jnp.float32),
+        readout=None,
         modes=get("modes"),
         rest=get("rest"),
     )

@@ -1,21 +1,25 @@
-"""The training table: a design over the pigmentation parameters, walked in groups of rows.
+"""The training table: a design over the parameters, simulated row by row or walked in groups.
 
-Absorption changes no path, only its weight. So `SHARE` rows with the same melanosome contents, and
-everything else their own, are served by one set of paths, walked for the least absorbing mixture
-among them; their Monte Carlo errors are therefore not independent of each other.
+Absorption changes no path, only its weight. So `SHARE` rows that agree in what changes paths, and
+have everything else their own, are served by one set of paths, walked for the least absorbing
+mixture among them; their Monte Carlo errors are therefore not independent of each other.
 
 A table is a Zarr group that xarray opens: `reflectance` and `standard_error` over (row,
-wavelength_nm), `design` over (row, parameter). It is made whole at once, filled chunk by chunk, and
-rows still to come are NaN, so that a table interrupted at any moment goes on where it stopped. Each
-chunk has its own random key, so that the same seed gives the same table however it was interrupted.
+wavelength_nm), `design` over (row, parameter). Its rows are there from the beginning, NaN until
+they are made, a chunk at a time. A chunk has its own random key, is written whole or not at all,
+and its standard errors last: whoever makes it, in whatever order and after however many kills, the
+same seed gives the same bits. So processes share a table by taking chunks that nobody is at, and
+a table grows by further rows of the same sequence.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-import uuid
-from concurrent.futures import ThreadPoolExecutor
+import time
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager, nullcontext, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -37,6 +41,10 @@ ROWS = 16_384
 RAYS = 8192  # of each set of paths
 SHARE = 8  # rows that one set of paths serves
 GROUPS = 8  # sets of paths of one melanosome form that walk together
+GENERATORS = ("walker", "adding")
+ADDING_ORDER = 6  # of what `adding` stores; its error, below 3e-4, is far below the surrogate's
+ADDING_CHECK = 12  # the order that the first row of each chunk and form is held against
+WAIT = 0.2  # seconds between looks at what another process is at
 ABSORB = 0.5  # share of the absorption that ends rays on the way (the rest is in the weights)
 INCIDENCE_DEG = 8.0
 WAVELENGTHS = np.arange(250.0, 2500.1, 5.0)
@@ -50,47 +58,52 @@ class Axis(NamedTuple):
     lower: float
     upper: float
     spread: str  # "log", "linear", or "square" and "cube": denser near `lower`
+    source: str  # of the range
+    paths: bool = False  # it changes paths, so rows that share them agree in it
 
 
-# Contents as wide as physiology and Table I need: melanosomes 1 to 10 % on average (Lister 2013),
-# melanin 17.9 to 72.3 % within them (Kollias et al. 1991) times their concentrations (Hennessy et
-# al. 2005), blood 0.2 to 4 % and more in lesions (Jacques 1996), water as in Blank (1952).
+MELANOSOMES = "1 to 10 % of the epidermis on average (Lister 2013), more in single strata"
+MELANIN = "17.9 to 72.3 % of a melanosome (Kollias et al. 1991), at the ratios of Hennessy (2005)"
+BLOOD = "0.2 to 4 %, more in lesions (Jacques 1996)"
 DESIGN = (
-    Axis("melanosome_granulosum", 0.0, 12.0, "square"),
-    Axis("melanosome_spinosum", 0.0, 12.0, "square"),
-    Axis("melanosome_basale", 0.0, 12.0, "square"),
-    Axis("colloidal_melanin", 0.0, 20.0, "cube"),
-    Axis("eumelanin", 5.0, 150.0, "log"),
-    Axis("pheomelanin", 0.2, 20.0, "log"),
-    Axis("blood_papillary", 0.02, 12.0, "log"),
-    Axis("blood_reticular", 0.02, 12.0, "log"),
-    Axis("oxygen_saturation", 0.0, 1.0, "linear"),
-    Axis("water", 0.4, 1.3, "linear"),
-    Axis("lipids", 0.0, 2.0, "linear"),
+    Axis("melanosome_granulosum", 0.0, 12.0, "square", MELANOSOMES, paths=True),
+    Axis("melanosome_spinosum", 0.0, 12.0, "square", MELANOSOMES, paths=True),
+    Axis("melanosome_basale", 0.0, 12.0, "square", MELANOSOMES, paths=True),
+    Axis("colloidal_melanin", 0.0, 20.0, "cube", "0.8 to 15 % in Table I of the paper"),
+    Axis("eumelanin", 5.0, 150.0, "log", MELANIN),
+    Axis("pheomelanin", 0.2, 20.0, "log", MELANIN),
+    Axis("blood_papillary", 0.02, 12.0, "log", BLOOD),
+    Axis("blood_reticular", 0.02, 12.0, "log", BLOOD),
+    Axis("oxygen_saturation", 0.0, 1.0, "linear", "all that is possible"),
+    Axis("water", 0.4, 1.3, "linear", "dry to oedematous, as in Blank (1952)"),
+    Axis("lipids", 0.0, 2.0, "linear", "none to twice the usual"),
 )
 NAMES = tuple(axis.name for axis in DESIGN)
+PATHS = np.array([axis.paths for axis in DESIGN])
 
 
-PATH_AXES = 3  # the first axes of the design: what changes paths, the same within a group
-
-
-def design(rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def design(rows: int, seed: int = 0, share: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Parameters (rows, P) and melanosome form (rows,; index into FORMS) of the design.
 
-    Scrambled Sobol sequences, one group of `SHARE` rows for each form in turn, so that the first
-    rows of a larger table are those of a smaller one.
+    Scrambled Sobol sequences, one group of `share` rows for each form in turn, so that the first
+    rows of a larger table are those of a smaller one. Rows of a group agree in what changes paths.
     """
     from scipy.stats import qmc
 
-    groups = -(-rows // (SHARE * len(FORMS)))
+    share = share or SHARE
+    groups = -(-rows // (share * len(FORMS)))
 
     def sobol(dimensions: int, count: int, stream: int) -> np.ndarray:
         generator = np.random.default_rng([seed, stream])
         points = qmc.Sobol(dimensions, rng=generator)
         return points.random(1 << int(np.ceil(np.log2(max(count, 2)))))[:count]
 
-    paths = np.repeat(sobol(PATH_AXES, groups, 0), SHARE, axis=0)
-    unit = np.hstack([paths, sobol(len(DESIGN) - PATH_AXES, groups * SHARE, 1)])
+    if share == 1:
+        unit = sobol(len(DESIGN), groups, 2)
+    else:
+        unit = np.empty((groups * share, len(DESIGN)))
+        unit[:, PATHS] = np.repeat(sobol(int(PATHS.sum()), groups, 0), share, axis=0)
+        unit[:, ~PATHS] = sobol(int((~PATHS).sum()), groups * share, 1)
     columns = []
     for u, axis in zip(unit.T, DESIGN, strict=True):
         if axis.spread == "log":
@@ -98,9 +111,9 @@ def design(rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         else:
             power = {"linear": 1, "square": 2, "cube": 3}[axis.spread]
             columns.append(axis.lower + (axis.upper - axis.lower) * u**power)
-    grouped = np.stack(columns, axis=1).reshape(groups, 1, SHARE, -1)
-    both = np.repeat(grouped, len(FORMS), axis=1).reshape(groups * len(FORMS) * SHARE, -1)
-    form = np.arange(len(both)) // SHARE % len(FORMS)
+    grouped = np.stack(columns, axis=1).reshape(groups, 1, share, -1)
+    both = np.repeat(grouped, len(FORMS), axis=1).reshape(groups * len(FORMS) * share, -1)
+    form = np.arange(len(both)) // share % len(FORMS)
     return both[:rows], form[:rows]
 
 
@@ -116,6 +129,9 @@ def _coefficients(form: str):
     return jax.jit(jax.vmap(one))
 
 
+SPECTRAL = ("index", "mu_a", "mu_particle", "hit_albedo", "theta_0", "mu_fibre", "mu_tissue")
+
+
 def _side_by_side(medium: Layers) -> Layers:
     """Rows as further wavelengths of one set of layers: they share thicknesses and surface."""
     first = jax.tree.map(lambda a: a[0], medium)
@@ -123,13 +139,7 @@ def _side_by_side(medium: Layers) -> Layers:
     def wide(a: jax.Array) -> jax.Array:  # (r, ..., w) -> (..., r w)
         return jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1)
 
-    return first._replace(
-        **{
-            name: wide(getattr(medium, name))
-            for name in ("index", "mu_a", "mu_particle", "hit_albedo", "theta_0", "mu_fibre")
-        },
-        mu_tissue=wide(medium.mu_tissue),
-    )
+    return first._replace(**{name: wide(getattr(medium, name)) for name in SPECTRAL})
 
 
 def walk_rows(
@@ -142,7 +152,7 @@ def walk_rows(
     """
     w = len(WAVELENGTHS)
     groups = parameters.reshape(-1, SHARE, parameters.shape[-1])
-    if not (groups[..., :PATH_AXES] == groups[:, :1, :PATH_AXES]).all():
+    if not (groups[..., PATHS] == groups[:, :1, PATHS]).all():
         raise HyliosError(f"each {SHARE} rows must have the same melanosome contents")
     count = len(groups)
     least = groups.min(axis=1)
@@ -181,6 +191,28 @@ def walk_rows(
     return reflectance, error
 
 
+def add_rows(parameters: np.ndarray, form: str) -> tuple[np.ndarray, np.ndarray]:
+    """As `walk_rows`, by the deterministic solver; the error is that of the first row."""
+    from hylios_fit import adding
+
+    defaults = Specimen().values
+
+    def solve(row: np.ndarray, order: int) -> np.ndarray:
+        values = {**defaults, **dict(zip(NAMES, row.tolist(), strict=True))}
+        medium = skin.let_stand(_coefficients_of(row, form), values, form)
+        angle = float(np.radians(INCIDENCE_DEG))
+        return np.asarray(adding.skin(medium, incidence=angle, order=order).reflectance)
+
+    reflectance = np.stack([solve(row, ADDING_ORDER) for row in parameters])
+    error = np.abs(reflectance[0] - solve(parameters[0], ADDING_CHECK))
+    return reflectance, np.broadcast_to(error, reflectance.shape)
+
+
+def _coefficients_of(row: np.ndarray, form: str) -> Layers:
+    medium = _coefficients(form)(jnp.asarray(row[None], jnp.float32))
+    return jax.tree.map(lambda a: a[0], medium)
+
+
 def surface_share(specimen: Specimen) -> float:
     """What the surface reflects at once at the table's angle of incidence."""
     return fresnel.surface_reflectance(
@@ -190,15 +222,25 @@ def surface_share(specimen: Specimen) -> float:
 
 # --- storing ----------------------------------------------------------------------------------
 
+COLUMNS = ("reflectance", "standard_error", "design", "form", "parameter", "lower", "upper")
+ATTRIBUTES = ("hylios_fit", "seed", "rays", "generator", "surface", "incidence_deg")
 
-def _empty(rows: int, seed: int, rays: int) -> xarray.Dataset:
+
+def _empty(
+    rows: int, seed: int, rays: int, generator: str = "walker", share: int | None = None
+) -> xarray.Dataset:
     import xarray
 
     from hylios_fit import __version__
 
-    parameters, form = design(rows, seed)
+    parameters, form = design(rows, seed, share)
     blank = np.full((rows, len(WAVELENGTHS)), np.nan, np.float32)
     unit = {"units": "1"}
+
+    # variable-length strings: those of fixed length have no stable form in Zarr
+    def words(values: Any) -> tuple[str, np.ndarray]:
+        return "parameter", np.array(list(values), dtype=object)
+
     return xarray.Dataset(
         {
             "reflectance": (("row", "wavelength_nm"), blank, unit),
@@ -208,11 +250,12 @@ def _empty(rows: int, seed: int, rays: int) -> xarray.Dataset:
         },
         {
             "wavelength_nm": ("wavelength_nm", WAVELENGTHS, {"units": "nm"}),
-            # variable-length strings: those of fixed length have no stable form in Zarr
-            "parameter": ("parameter", np.array(NAMES, dtype=object)),
-            "unit": ("parameter", np.array([SPECS[name].unit for name in NAMES], dtype=object)),
+            "parameter": words(NAMES),
+            "unit": words(SPECS[name].unit for name in NAMES),
             "lower": ("parameter", np.array([axis.lower for axis in DESIGN])),
             "upper": ("parameter", np.array([axis.upper for axis in DESIGN])),
+            "spread": words(axis.spread for axis in DESIGN),
+            "source": words(axis.source for axis in DESIGN),
         },
         {
             "format": FORMAT,
@@ -220,109 +263,314 @@ def _empty(rows: int, seed: int, rays: int) -> xarray.Dataset:
             "hylios_fit": __version__,
             "seed": seed,
             "rays": rays,
-            "rows_sharing_paths": SHARE,
-            "generator": "walker",
+            "rows_sharing_paths": share or SHARE,
+            "generator": generator,
             "surface": surface_share(Specimen()),
             "incidence_deg": INCIDENCE_DEG,
         },
     )
 
 
-def open_table(path: str | Path) -> xarray.Dataset:
-    """Open a table and check that it is one that this version understands."""
-    import xarray
+def _open(path: Path, mode: Any = "r") -> Any:
+    """The Zarr group, if it is a table of this version's format."""
+    import zarr
 
-    path = Path(path)
     if not path.exists():
         raise HyliosError(f"there is no table at {path}")
     try:
-        table = xarray.open_zarr(path, consolidated=False)
+        store = zarr.open_group(path, mode=mode)
     except Exception as error:
         raise HyliosError(f"{path} is not a table (a Zarr group): {error}") from error
-    if table.attrs.get("format") != FORMAT:
+    if store.attrs.get("format") != FORMAT:
         raise HyliosError(f"{path} is a Zarr group, but not a {FORMAT}")
-    version = table.attrs.get("format_version")
+    version = store.attrs.get("format_version")
     if version != FORMAT_VERSION:
         raise HyliosError(
             f"{path} was written in version {version} of the table's format by hylios_fit "
-            f"{table.attrs.get('hylios_fit', '?')}; this one reads version {FORMAT_VERSION}: "
+            f"{store.attrs.get('hylios_fit', '?')}; this one reads version {FORMAT_VERSION}: "
             "make the table again with `hylios-fit table`"
         )
-    missing = {"reflectance", "standard_error", "design", "form"} - set(table.variables)
+    missing = [name for name in COLUMNS if name not in store]
+    missing += [name for name in ATTRIBUTES if name not in store.attrs]
     if missing:
-        raise HyliosError(f"{path} lacks {', '.join(sorted(missing))}")
+        raise HyliosError(f"{path} lacks {', '.join(missing)}")
+    return store
+
+
+def open_table(path: str | Path) -> xarray.Dataset:
+    """Open a table, finished or not, and check that it is one that this version understands."""
+    import xarray
+
+    _open(Path(path))
+    try:
+        return xarray.open_zarr(path, chunks=None, consolidated=False)
+    except Exception as error:
+        raise HyliosError(
+            f"{path} cannot be read ({error}): if it was killed while it grew, "
+            "`hylios-fit table --resume` mends it"
+        ) from error
+
+
+def read_table(path: str | Path, least_rows: int = 1) -> xarray.Dataset:
+    """The finished rows of a table, in memory, checked to be fit for training.
+
+    Args:
+        least_rows: finished rows that each melanosome form must have.
+
+    Raises:
+        HyliosError: a damaged table, rows of another version, a parameter without a range, or too
+            few rows.
+    """
+    table = open_table(path)
+    _same(table.attrs, Path(path), "has rows", hylios_fit=_version())
+    try:
+        table = table.load()
+    except Exception as error:
+        raise HyliosError(f"{path} is damaged: {error}; make the table again") from error
+    for name, low, high in zip(
+        table["parameter"].values, table["lower"].values, table["upper"].values, strict=True
+    ):
+        if not low < high:
+            raise HyliosError(f"{path}: the range of {name} is {low:g} to {high:g}, of no width")
+    # standard errors are written last
+    table = table.isel(row=np.flatnonzero(np.isfinite(table["standard_error"]).any(axis=1)))
+    for name in ("reflectance", "standard_error", "design"):
+        bad = ~np.isfinite(table[name].values)
+        if bad.any():
+            row, column = np.argwhere(bad)[0]
+            where = table["wavelength_nm" if name != "design" else "parameter"].values[column]
+            raise HyliosError(
+                f"{path} is damaged: {bad.any(axis=1).sum()} of its finished rows have no "
+                f"{name} (the first is row {row}, at {where}); make the table again"
+            )
+    forms = str(table["form"].attrs["flag_meanings"]).split()
+    for number, form in enumerate(forms):
+        count = int((table["form"].values == number).sum())
+        if count < least_rows:
+            raise HyliosError(
+                f"{path} has {count} finished rows of the form {form}, training needs at least "
+                f"{least_rows}: go on with `hylios-fit table --resume`, or ask it for more --rows"
+            )
     return table
 
 
 def generate(
     path: str | Path,
-    rows: int = ROWS,
+    rows: int | None = None,
     seed: int = 0,
     resume: bool = False,
     rays: int = RAYS,
     progress: bool = True,
     threads: int = 2,
+    generator: str = "walker",
+    share: int | None = None,
+    executor: Executor | None = None,
 ) -> Path:
-    """Make or go on with the table at `path`."""
-    import zarr
+    """Make the table at `path`, go on with it, or append rows to it.
+
+    Several processes may work at one table at once, each called with `resume`.
+
+    Args:
+        rows: of the whole table; default: those that it has, `ROWS` for a new one.
+        seed: of the design and of the walks.
+        resume: go on with a table that exists.
+        rays: of each set of paths (walker).
+        threads: chunks of rows that are made at once, without an `executor`.
+        generator: one of `GENERATORS`.
+        share: rows of a group, which agree in what changes paths; the walker has `SHARE`, the
+            others 1.
+        executor: where the chunks are made, instead of threads; for a Dask cluster that shares
+            the folder, `dask.distributed.Client(...).get_executor()`.
+
+    Raises:
+        HyliosError: a table that exists or was begun otherwise, or cannot be written.
+    """
     from tqdm import tqdm
 
     path = Path(path)
-    chunk_rows = len(FORMS) * GROUPS * SHARE
-    if rows < chunk_rows or rows % chunk_rows:
-        raise HyliosError(f"a table has a multiple of {chunk_rows} rows, asked for {rows}")
+    if generator not in GENERATORS:
+        raise HyliosError(f"generator is one of {', '.join(GENERATORS)}, got {generator!r}")
+    walks = generator == "walker"
+    share = share or (SHARE if walks else 1)
+    if (walks and share != SHARE) or (GROUPS * SHARE) % share:
+        raise HyliosError(f"{share} rows in a group: the {generator} cannot")
+    rays = rays if walks else 0
+    step = len(FORMS) * GROUPS * SHARE
+    if rows is not None and (rows < step or rows % step):
+        raise HyliosError(f"a table has a multiple of {step} rows, asked for {rows}")
     if path.exists() and not resume:
         raise HyliosError(f"{path} exists; add --resume to go on with it, or choose another name")
-    if path.exists():
-        _same(open_table(path).attrs, path, seed=seed, rays=rays)
-        stored = open_table(path).sizes["row"]
-        if stored != rows:
-            raise HyliosError(f"{path} has {stored} rows, asked for {rows}")
-    else:
-        new = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
-        chunks = (chunk_rows, len(WAVELENGTHS))
-        encoding = {name: {"chunks": chunks} for name in ("reflectance", "standard_error")}
+    with _writing(path):
+        if not path.exists():
+            _begin(path, _empty(rows or ROWS, seed, rays, generator, share), step)
+        asked = {"generator": generator, "seed": seed, "rays": rays, "rows_sharing_paths": share}
+        total = _extend(path, rows, asked)
+    done = _done(path)
+    starts = [s for s in range(0, total, step) if not done[s : s + step].all()]
+    with (
+        tqdm(total=total, initial=int(done.sum()), unit="row", disable=not progress) as bar,
+        nullcontext(executor) if executor else ThreadPoolExecutor(threads) as pool,
+    ):
+        while starts:
+            futures = {pool.submit(make_chunk, str(path), start): start for start in starts}
+            try:
+                for future in as_completed(futures):
+                    if future.result():
+                        starts.remove(futures[future])
+                        bar.update(step)
+            except BaseException:
+                for future in futures:
+                    future.cancel()
+                raise
+            if starts:
+                time.sleep(WAIT)  # for those that another process is at
+    return path
+
+
+def _done(path: Path) -> np.ndarray:
+    """Which rows are finished: their standard errors are there."""
+    store = _open(path)
+    try:
+        return np.isfinite(store["standard_error"][:, 0])
+    except Exception as error:
+        raise HyliosError(f"{path} is damaged: {error}; make the table again") from error
+
+
+def make_chunk(path: str, start: int) -> bool:
+    """Make the chunk that begins at row `start`, unless it is there: the unit of all the work.
+
+    False if another process is at it.
+    """
+    folder = Path(path)
+    store = _open(folder, "r+")
+    about = store.attrs
+    _same(about, folder, "was begun", hylios_fit=_version())
+    part = slice(start, start + store["standard_error"].chunks[0])
+    number = start // store["standard_error"].chunks[0]
+    with _writing(folder), _claimed(folder / "standard_error" / "c" / str(number)) as mine:
+        if not mine:
+            return False
+        if np.isfinite(store["standard_error"][part, 0]).all():
+            return True
+        parameters, form = store["design"][part], store["form"][part]
+        reflectance, error = np.empty((2, len(parameters), len(WAVELENGTHS)), np.float32)
+        for i, name in enumerate(FORMS):
+            rows = form == i
+            if about["generator"] == "walker":
+                key = jax.random.fold_in(jax.random.key(about["seed"]), start)
+                found = walk_rows(parameters[rows], name, jax.random.fold_in(key, i), about["rays"])
+            else:
+                found = add_rows(parameters[rows], name)
+            reflectance[rows], error[rows] = found
+        store["reflectance"][part] = reflectance
+        store["standard_error"][part] = error  # last: it marks rows as done
+    return True
+
+
+def _begin(path: Path, empty: xarray.Dataset, step: int) -> None:
+    """A table without finished rows, there at once; unless another process was faster."""
+    new = path.with_name(f".{path.name}.new")
+    chunks = {name: (step, *empty[name].shape[1:]) for name in COLUMNS[:4]}
+    with _claimed(path.parent, wait=True):
+        if path.exists():
+            return
+        shutil.rmtree(new, ignore_errors=True)  # of one that was killed
         try:
-            _empty(rows, seed, rays).to_zarr(
-                new, consolidated=False, encoding=encoding, zarr_format=3
-            )
+            encoding = {name: {"chunks": shape} for name, shape in chunks.items()}
+            empty.to_zarr(new, consolidated=False, encoding=encoding, zarr_format=3)
             os.replace(new, path)
         except BaseException:
             shutil.rmtree(new, ignore_errors=True)
             raise
-    store: Any = zarr.open_group(path, mode="r+")
-    parameters, form = design(rows, seed)
-    done = np.isfinite(store["standard_error"][:, 0])
-    starts = [s for s in range(0, rows, chunk_rows) if not done[s : s + chunk_rows].all()]
-    key = jax.random.key(seed)
-
-    def chunk(start: int) -> tuple[int, np.ndarray, np.ndarray]:
-        part = slice(start, start + chunk_rows)
-        shape = (chunk_rows, len(WAVELENGTHS))
-        reflectance, error = np.empty(shape), np.empty(shape)
-        for i, name in enumerate(FORMS):
-            mine = form[part] == i
-            row_key = jax.random.fold_in(jax.random.fold_in(key, start), i)
-            found = walk_rows(parameters[part][mine], name, row_key, rays)
-            reflectance[mine], error[mine] = found
-        return start, reflectance, error
-
-    with (
-        tqdm(total=rows, initial=int(done.sum()), unit="row", disable=not progress) as bar,
-        ThreadPoolExecutor(threads) as pool,
-    ):
-        for start, reflectance, error in pool.map(chunk, starts):
-            part = slice(start, start + len(reflectance))
-            store["reflectance"][part] = reflectance.astype(np.float32)
-            store["standard_error"][part] = error.astype(np.float32)  # last: it marks rows as done
-            bar.update(len(reflectance))
-    return path
 
 
-def _same(attributes: dict[Any, Any], path: Path, **asked: Any) -> None:
+def _extend(path: Path, rows: int | None, asked: dict[str, Any]) -> int:
+    """Append rows to what there is, if more are asked for; how many there are now.
+
+    Standard errors grow last: a table killed on the way has its old rows, and is extended anew.
+    """
+    with _claimed(path, wait=True):
+        store = _open(path, "r+")
+        _same(store.attrs, path, "was begun", hylios_fit=_version(), **asked)
+        old = store["standard_error"].shape[0]
+        total = old if rows is None else rows
+        if total < old:
+            raise HyliosError(f"{path} has {old} rows, asked for {total}: a table does not shrink")
+        parameters, form = design(total, asked["seed"], asked["rows_sharing_paths"])
+        names = tuple(store["parameter"][:])
+        if names != NAMES or not np.array_equal(store["design"][:old], parameters[:old]):
+            raise HyliosError(
+                f"{path} was begun with another design of parameters: make the table again"
+            )
+        try:
+            if total > old:
+                _resize(store, total)
+                store["design"][old:], store["form"][old:] = parameters[old:], form[old:]
+                store["standard_error"].resize((total, len(WAVELENGTHS)))
+        except BaseException:
+            with suppress(OSError):
+                _resize(store, old)
+            raise
+    return total
+
+
+def _resize(store: Any, rows: int) -> None:
+    for name in ("design", "form", "reflectance"):
+        store[name].resize((rows, *store[name].shape[1:]))
+
+
+def _version() -> str:
+    from hylios_fit import __version__
+
+    return __version__
+
+
+def _same(attributes: Any, path: Path, how: str, **asked: Any) -> None:
     for name, value in asked.items():
         if attributes.get(name) != value:
-            raise HyliosError(
-                f"{path} was begun with {name} {attributes.get(name)}, not {value}: "
-                "go on with what it was begun with"
+            advice = (
+                "rows of two versions do not mix, make the table again"
+                if name == "hylios_fit"
+                else "go on with what it was begun with"
             )
+            raise HyliosError(
+                f"{path} {how} with {name} {attributes.get(name)}, not {value}: {advice}"
+            )
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise HyliosError(
+            f"{path}: cannot be written: {error.strerror or error}; what was there stays, "
+            "`hylios-fit table --resume` goes on with it"
+        ) from error
+
+
+@contextmanager
+def _claimed(folder: Path, wait: bool = False) -> Iterator[bool]:
+    """Whether nobody else is at work under `folder`, and will not be within this context.
+
+    The system takes the lock back when its holder ends, in whatever way. Where it has none
+    (Windows, some network drives) two may do the same work, and come to the same bits.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        yield True
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        free = True
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            free = False
+        except OSError:
+            pass  # no locks here
+        yield free
+    finally:
+        os.close(handle)

@@ -1,7 +1,11 @@
 """The surrogate: its range, its gradients, its file, and its training."""
 
+import errno
 import json
+import os
+from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -101,6 +105,143 @@ def test_bands_are_interpolated_not_resampled(surrogate):
         member.on([200.0])
 
 
+def inside(surrogate, count, form=0):
+    """Parameters in the box, with a melanosome form."""
+    member = surrogate.at("complex")
+    u = np.random.default_rng(5).random((count, len(member.names)))
+    x = np.asarray(member.lower) + u * np.asarray(member.upper - member.lower)
+    return np.column_stack([x, np.broadcast_to(form, count)]).astype(np.float32)
+
+
+def test_wide_bands_are_means_of_the_spectrum(surrogate):
+    member = surrogate.at("complex")
+    grid = member.wavelength_nm
+    p = inside(surrogate, 10)[:, :-1]
+    whole = np.asarray(member(p), float)
+    nm = np.arange(397.0, 708.0, 7.0)  # neither the surrogate's wavelengths nor its step
+    response = np.exp(-(((nm - np.array([[450.0], [545.0], [600.0]])) / 35) ** 2))
+    camera = member.on(nm, response)
+    fine = np.linspace(nm[0], nm[-1], 20_001)
+    shape = np.stack([np.interp(fine, nm, row) for row in response])
+    spectra = np.stack([np.interp(fine, grid, row) for row in whole])
+    expected = np.trapezoid(spectra[:, None] * shape, fine) / np.trapezoid(shape, fine)
+    assert np.allclose(camera(p), expected, atol=2e-6)
+    assert np.allclose(member.on(nm, 7 * response)(p), camera(p), atol=1e-6)
+    assert np.allclose(camera.wavelength_nm, [450, 545, 600], atol=2)
+
+    flat = np.zeros((1, 451))
+    flat[0, 100:140] = 1.0
+    assert np.allclose(member.onto(flat)(p)[:, 0], whole[:, 100:140].mean(axis=1), atol=1e-6)
+    one = member.on([grid[100], grid[101]], np.ones((1, 2)))
+    assert np.allclose(one(p)[:, 0], whole[:, 100:102].mean(axis=1), atol=1e-6)
+
+
+def test_the_error_of_a_wide_band_is_that_of_its_wavelengths_together(surrogate):
+    member = surrogate.at("complex")
+    typical = np.exp(np.asarray(member.mean, float))  # light from inside, at each wavelength
+    weights = np.zeros((2, 451))
+    weights[0, 40:60], weights[1, 300:400] = 1.0, np.linspace(0.1, 1, 100)
+    weights /= weights.sum(axis=1, keepdims=True)
+    surface = float(member.surface)
+    modes = np.asarray(member.modes, float)
+    level = weights @ typical
+    expected = (modes * typical) @ weights.T / level  # relative, as each mode moves the band
+    band = member.onto(weights)
+    assert np.allclose(band.modes, expected, atol=1e-7)
+    assert np.all(np.asarray(band.rest) >= 0)
+    covariance = band.error_covariance(surface + level)
+    assert covariance.shape == (2, 2)
+    assert np.linalg.eigvalsh(covariance).min() > 0
+
+
+def test_bands_that_cannot_be_are_refused(surrogate):
+    member = surrogate.at("complex")
+    nm = np.array([400.0, 500.0])
+    for arguments, message in (
+        ((nm, np.ones((3, 5))), r"expected shape \(bands, 2\) .* got \(3, 5\)"),
+        ((nm[::-1], np.ones((3, 2))), "at rising wavelengths"),
+        ((nm, [[1.0, -1.0]]), "none below 0"),
+        ((nm, [[0.0, 0.0]]), "one above 0"),
+        ((nm, [[np.nan, 1.0]]), "finite"),
+        (([200.0, 300.0], np.ones((1, 2))), "covers 250 to 2500"),
+        (([np.nan],), "list of wavelengths"),
+        (([],), "list of wavelengths"),
+    ):
+        with pytest.raises(HyliosError, match=message):
+            member.on(*arguments)
+    with pytest.raises(HyliosError, match=r"expected shape \(bands, 451\), got \(1, 7\)"):
+        member.onto(np.ones((1, 7)))
+    with pytest.raises(HyliosError, match="project the surrogate itself"):
+        member.on(nm).on([450.0])
+    with pytest.raises(HyliosError, match="ask the surrogate itself"):
+        surrogate.on(nm).of(Specimen(), [450.0])
+
+
+def test_a_surrogate_on_bands_is_called_as_the_whole_one(surrogate):
+    camera = surrogate.on([450.0, 550.0, 602.5])
+    rows = inside(surrogate, 40, form=np.arange(40) % 2)  # both forms in one batch
+    found = np.asarray(camera(rows))
+    assert found.shape == (40, 3)
+    for number, form in enumerate(surrogate.forms):
+        mine = rows[number::2]
+        expected = surrogate.at(form).on([450.0, 550.0, 602.5])(mine[:, :-1])
+        assert np.allclose(found[number::2], expected, atol=1e-6)
+        assert np.allclose(camera(mine), expected, atol=1e-6)  # of one form
+    assert camera(rows.reshape(4, 10, -1)).shape == (4, 10, 3)
+    with pytest.raises(HyliosError, match="outside the surrogate's training range"):
+        camera(-rows)
+
+
+def test_a_call_compiles_once_and_what_is_traced_is_not_kept(surrogate):
+    camera = surrogate.on([450.0, 550.0])
+    rows = inside(surrogate, 3)
+    kept = module._ready.cache_info().currsize
+    for row in rows:
+        camera(row)
+    assert module._ready.cache_info().currsize <= kept + 1
+    (_, _, compiled), *_ = module._ready(camera).forms
+    assert compiled._cache_size() == 1
+
+    def total(members, p):  # the surrogate itself is traced, as where its weights are trained
+        return jnp.sum(members(p))
+
+    before = module._ready.cache_info(), module._compiled.cache_info()
+    slopes = eqx.filter_jit(eqx.filter_grad(total))(camera, jnp.asarray(rows))
+    assert (module._ready.cache_info(), module._compiled.cache_info()) == before
+    assert jnp.any(slopes.at("complex").components != 0)
+
+
+def test_a_large_batch_goes_in_blocks_to_the_same_end(surrogate, monkeypatch):
+    rows = inside(surrogate, 70, form=np.arange(70) % 2)
+    expected = np.asarray(surrogate.on([450.0, 550.0])(rows))
+    monkeypatch.setattr(module, "BLOCK", 16)
+    small = surrogate.on([450.0, 550.0])
+    assert np.allclose(small(rows), expected, atol=1e-6)
+    assert np.allclose(small(rows[1::2]), expected[1::2], atol=1e-6)
+    member = surrogate.at("complex").on([450.0, 550.0])
+    assert np.allclose(member(rows[:, :-1])[::2], expected[::2], atol=1e-6)
+
+
+def test_numbers_are_taken_in_any_array(surrogate):
+    (row,) = inside(surrogate, 1)
+    expected = np.asarray(surrogate(jnp.asarray(row)))
+    for given in (row, row.astype(float), row.tolist()):
+        assert np.allclose(surrogate(given), expected, atol=1e-6)
+        assert np.allclose(surrogate.at("complex")(given[:-1]), expected, atol=1e-6)
+
+
+def test_the_experiment_on_speed_measures_what_it_draws(surrogate, tmp_path):
+    from experiments import surrogate_speed
+
+    found = surrogate_speed.run(batches=(1, 8), repeats=3, alone=4, progress=False)
+    assert set(found["goals_per_second"]) < set(found["per_second"]) == set(found["compile_s"])
+    for points in found["per_second"].values():
+        assert [point["batch"] for point in points] == [1, 8]
+        assert all(0 < point["low"] <= point["median"] <= point["high"] for point in points)
+    surrogate_speed.draw(json.loads(json.dumps(found)), tmp_path / "speed.png")
+    assert (tmp_path / "speed.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_error_covariance_is_one(surrogate):
     for form in surrogate.forms:
         covariance = surrogate.at(form).error_covariance(np.full(451, 0.4))
@@ -164,6 +305,20 @@ def test_other_files_are_errors(tmp_path):
 
     with pytest.raises(HyliosError, match="do not match their hash"):
         load_surrogate(rewritten(tmp_path, one_number))
+
+
+def test_a_full_disk_is_said_and_the_old_file_stays(tmp_path, monkeypatch):
+    path = tmp_path / "s.npz"
+    path.write_bytes(b"what was there")
+
+    def full(self, content):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(HyliosError, match=r"cannot write the surrogate .*: No space left"):
+        module.save(path, {}, {})
+    assert path.read_bytes() == b"what was there"
+    assert [file.name for file in tmp_path.iterdir()] == ["s.npz"]
 
 
 def test_a_pickle_is_not_loaded(tmp_path):

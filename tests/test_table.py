@@ -1,4 +1,11 @@
-"""The design, and a table that goes on where it stopped."""
+"""The design, and a table that goes on where it stopped, grows, and is shared by processes."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -10,6 +17,8 @@ from hylios_fit.skin import SPECS
 
 RAYS = 256
 ROWS = 24
+STEP = 8
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture
@@ -19,8 +28,23 @@ def small(monkeypatch):
     monkeypatch.setattr(table, "SHARE", 4)
 
 
-def make(path, **options):
-    return table.generate(path, rows=ROWS, rays=RAYS, progress=False, **options)
+@pytest.fixture
+def quick(small, monkeypatch):
+    """A stand-in for the walk, of the same key and parameters the same; what it was asked for."""
+    calls = []
+
+    def walk_rows(parameters, form, key, rays):
+        calls.append((form, parameters))
+        rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        shape = (len(parameters), len(table.WAVELENGTHS))
+        return rng.uniform(0.1, 0.9, shape), rng.uniform(1e-4, 1e-3, shape)
+
+    monkeypatch.setattr(table, "walk_rows", walk_rows)
+    return calls
+
+
+def make(path, rows=ROWS, rays=RAYS, **options):
+    return table.generate(path, rows=rows, rays=rays, progress=False, **options)
 
 
 def read(path):
@@ -35,6 +59,7 @@ def test_the_design_lies_in_its_ranges_and_fills_them():
     parameters, form = table.design(1024)
     assert parameters.shape == (1024, len(table.NAMES))
     for column, axis in zip(parameters.T, table.DESIGN, strict=True):
+        assert axis.source
         assert axis.lower <= column.min() < column.max() <= axis.upper
         assert SPECS[axis.name].lower <= axis.lower < axis.upper <= SPECS[axis.name].upper
         u = (column - axis.lower) / (axis.upper - axis.lower)
@@ -46,12 +71,23 @@ def test_the_design_lies_in_its_ranges_and_fills_them():
     assert list(np.bincount(form)) == [512, 512]
 
 
+@pytest.mark.parametrize("share", [1, table.SHARE])
 @pytest.mark.parametrize("rows", [32, 50, 100])
-def test_the_first_rows_of_a_larger_design_are_those_of_a_smaller(rows):
-    parameters, form = table.design(rows)
-    more, forms = table.design(512)
+def test_the_first_rows_of_a_larger_design_are_those_of_a_smaller(rows, share):
+    parameters, form = table.design(rows, share=share)
+    more, forms = table.design(512, share=share)
     np.testing.assert_array_equal(parameters, more[:rows])
     np.testing.assert_array_equal(form, forms[:rows])
+
+
+def test_rows_of_a_group_agree_in_what_changes_paths_and_differ_in_the_rest():
+    for share in (1, 4):
+        parameters, _ = table.design(64, share=share)
+        groups = parameters.reshape(-1, share, len(table.NAMES))
+        assert np.all(groups[..., table.PATHS] == groups[:, :1, table.PATHS])
+        for axis in range(len(table.NAMES)):
+            values = 32 // share if table.PATHS[axis] else 32  # each for both forms
+            assert len(np.unique(parameters[:, axis])) == values
 
 
 def test_another_seed_is_another_design():
@@ -77,7 +113,7 @@ def test_a_table_goes_on_where_it_stopped(small, tmp_path, monkeypatch):
 
     def cut(*arguments):
         calls.append(arguments)
-        if len(calls) == 4:  # in the middle of the second chunk
+        if len(calls) >= 4:  # in the middle of the second chunk
             raise KeyboardInterrupt
         return walk_rows(*arguments)
 
@@ -104,7 +140,7 @@ def test_a_table_goes_on_where_it_stopped(small, tmp_path, monkeypatch):
 def test_rows_of_a_group_share_paths_and_agree_with_their_own_walk(small):
     parameters, form = table.design(ROWS)
     mine = parameters[form == 1][:4]
-    assert np.all(mine[:, : table.PATH_AXES] == mine[0, : table.PATH_AXES])
+    assert np.all(mine[:, table.PATHS] == mine[0, table.PATHS])
     shared, error = table.walk_rows(mine, "dispersed", jax.random.key(3), 1024)
     assert shared.shape == error.shape == (4, len(table.WAVELENGTHS))
     again = np.repeat(mine[2:3], 4, axis=0)
@@ -120,8 +156,7 @@ def test_rows_of_a_group_share_paths_and_agree_with_their_own_walk(small):
 
 def empty(path):
     """A table that was begun and has no row."""
-    made = table._empty(ROWS, 0, RAYS)
-    made.to_zarr(path, consolidated=False, zarr_format=3)
+    table._begin(path, table._empty(ROWS, 0, RAYS), STEP)
     return path
 
 
@@ -133,8 +168,14 @@ def test_tables_that_cannot_be_gone_on_with_are_refused(small, tmp_path):
         make(path, resume=True, seed=5)
     with pytest.raises(HyliosError, match="begun with rays 256, not 32"):
         table.generate(path, rows=ROWS, rays=32, resume=True, progress=False)
-    with pytest.raises(HyliosError, match="has 24 rows, asked for 40"):
-        table.generate(path, rows=40, rays=RAYS, resume=True, progress=False)
+    with pytest.raises(HyliosError, match="has 24 rows, asked for 16: a table does not shrink"):
+        make(path, rows=16, resume=True)
+    with pytest.raises(HyliosError, match="begun with generator walker, not adding"):
+        make(path, resume=True, generator="adding")
+    with pytest.raises(HyliosError, match="generator is one of walker, adding, got 'magic'"):
+        make(path, generator="magic")
+    with pytest.raises(HyliosError, match="2 rows in a group: the walker cannot"):
+        make(path, resume=True, share=2)
     with pytest.raises(HyliosError, match="multiple of 8 rows, asked for 12"):
         table.generate(tmp_path / "new.zarr", rows=12, progress=False)
     assert not (tmp_path / "new.zarr").exists()
@@ -177,6 +218,217 @@ def test_a_failed_beginning_leaves_nothing(small, tmp_path, monkeypatch):
         raise OSError("no space left on device")
 
     monkeypatch.setattr(table.os, "replace", full)
-    with pytest.raises(OSError, match="no space"):
+    with pytest.raises(HyliosError, match="no space"):
         make(tmp_path / "t.zarr")
     assert list(tmp_path.iterdir()) == []
+
+
+# --- growing -------------------------------------------------------------------------------------
+
+
+def test_a_larger_table_extends_a_smaller_one(quick, tmp_path):
+    whole = read(make(tmp_path / "whole.zarr"))
+    path = make(tmp_path / "grown.zarr", rows=STEP)
+    quick.clear()
+    make(path, resume=True)
+    assert len(quick) == 4  # two further chunks of two forms
+    grown = read(path)
+    for name, values in whole.items():
+        np.testing.assert_array_equal(values, grown[name])
+    np.testing.assert_array_equal(table.open_table(path)["form"], table.design(ROWS)[1])
+    table.generate(path, rays=RAYS, resume=True, progress=False)  # as many rows as it has
+    assert len(quick) == 4
+
+
+def test_a_table_of_another_design_does_not_grow(quick, tmp_path, monkeypatch):
+    path = make(tmp_path / "t.zarr", rows=STEP)
+    wider = (*table.DESIGN[:-1], table.DESIGN[-1]._replace(upper=3.0))
+    monkeypatch.setattr(table, "DESIGN", wider)
+    with pytest.raises(HyliosError, match="begun with another design"):
+        make(path, resume=True)
+    assert table.open_table(path).sizes["row"] == STEP
+
+
+def test_rows_of_two_versions_do_not_mix(quick, tmp_path, monkeypatch):
+    path = make(tmp_path / "t.zarr", rows=STEP)
+    monkeypatch.setattr("hylios_fit.__version__", "99.0")
+    with pytest.raises(HyliosError, match=r"begun with hylios_fit .*, not 99.0: .* do not mix"):
+        make(path, resume=True)
+    with pytest.raises(HyliosError, match="do not mix"):
+        table.make_chunk(str(path), 0)  # a worker elsewhere
+    with pytest.raises(HyliosError, match=r"has rows with hylios_fit .*, not 99.0"):
+        table.read_table(path)
+
+
+def test_the_other_generator_writes_the_same_format(small, tmp_path, monkeypatch):
+    def add_rows(parameters, form):
+        return np.full((2, len(parameters), len(table.WAVELENGTHS)), [[[0.4]], [[1e-6]]])
+
+    monkeypatch.setattr(table, "add_rows", add_rows)
+    rows = table.read_table(make(tmp_path / "t.zarr", generator="adding"), ROWS // 2)
+    assert rows.attrs["generator"] == "adding"
+    assert rows.attrs["rows_sharing_paths"] == 1
+    assert rows.attrs["rays"] == 0
+    np.testing.assert_array_equal(rows["design"], table.design(ROWS, share=1)[0])
+    np.testing.assert_array_equal(rows["standard_error"], np.float32(1e-6))
+    assert set(rows.variables) == set(table._empty(STEP, 0, RAYS).variables)
+
+
+def test_rows_by_the_solver_are_those_of_their_specimens(monkeypatch):
+    from types import SimpleNamespace
+
+    from hylios_fit import adding, skin
+
+    def solver(layers, *, incidence, order, **_):  # the solver has tests of its own
+        assert incidence == pytest.approx(np.radians(table.INCIDENCE_DEG))
+        depth = np.sum((layers.mu_a + layers.mu_particle) * layers.thickness[:, None], axis=0)
+        return SimpleNamespace(reflectance=np.exp(-np.asarray(depth)) + 0.1 / order**2)
+
+    monkeypatch.setattr(adding, "skin", solver)
+    parameters = table.design(8, share=1)[0][1:4]
+    found, error = table.add_rows(parameters, "dispersed")
+    assert found.shape == error.shape == (3, len(table.WAVELENGTHS))
+    assert np.all(error > 0)
+    for row, mine in zip(parameters, found, strict=True):
+        specimen = table.Specimen(
+            dict(zip(table.NAMES, row.tolist(), strict=True)), "dispersed", ""
+        )
+        layers = specimen.layers(table.WAVELENGTHS)
+        layers = skin.let_stand(layers, specimen.values, "dispersed")
+        alone = solver(layers, incidence=np.radians(8.0), order=table.ADDING_ORDER).reflectance
+        np.testing.assert_allclose(mine, alone, rtol=1e-4)  # coefficients in float32
+
+
+# --- processes -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def processes(tmp_path_factory):
+    """What came of killing processes that make a table, in a fresh interpreter."""
+    if not hasattr(os, "fork"):
+        pytest.skip("needs fork and SIGKILL")
+    done = subprocess.run(
+        [sys.executable, ROOT / "tests" / "table_processes.py", tmp_path_factory.mktemp("tables")],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_killed_at_any_moment_it_resumes_with_nothing_lost_or_doubled(processes):
+    found = processes["kills"]
+    assert found.pop("moments") > 10
+    assert found == {"again": 0, "different": 0, "leftovers": 0, "failed": 0}
+
+
+def test_processes_share_a_table_and_take_over_from_one_that_was_killed(processes):
+    found = processes["together"]
+    assert found["statuses"] == [-9, 0, 0]
+    assert found["workers"] == 2
+    assert found["made"] == 6  # three chunks of two forms
+    assert found["twice"] == 0
+    assert not found["different"]
+
+
+def test_a_chunk_that_another_is_at_is_left_to_it(quick, tmp_path):
+    pytest.importorskip("fcntl")
+    path = empty(tmp_path / "t.zarr")
+    with table._claimed(path / "standard_error" / "c" / "0") as mine:
+        assert mine
+        assert not table.make_chunk(str(path), 0)
+        assert not quick
+    assert table.make_chunk(str(path), 0)
+    assert table.make_chunk(str(path), 0)  # it is there
+    assert len(quick) == 2
+
+
+def test_a_dask_cluster_makes_the_same_table(quick, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    whole = read(make(tmp_path / "whole.zarr", threads=1))
+    with distributed.Client(
+        processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None
+    ) as client:
+        shared = read(make(tmp_path / "dask.zarr", executor=client.get_executor()))
+    for name, values in whole.items():
+        np.testing.assert_array_equal(values, shared[name])
+
+
+# --- bad tables ----------------------------------------------------------------------------------
+
+
+def test_a_full_disk_is_said_and_what_was_there_stays(quick, tmp_path, monkeypatch):
+    path = make(tmp_path / "t.zarr", rows=STEP)
+    before = read(path)
+    replace = os.replace
+
+    def full(source, target):
+        if "/c/1/" in str(target):  # the second chunk
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(HyliosError, match=r"cannot be written: No space left on device; what was"):
+        make(path, rows=2 * STEP, resume=True)
+    monkeypatch.undo()
+    for name, values in read(path).items():
+        np.testing.assert_array_equal(values[:STEP], before[name])
+    assert len(table.read_table(path)["row"]) == STEP
+
+
+def spoilt(path, **arrays):
+    """A finished table with some values written over: name -> (row, column, value)."""
+    import zarr
+
+    make(path)
+    store = zarr.open_group(path, mode="r+")
+    for name, (row, column, value) in arrays.items():
+        store[name][row, column] = value
+    return path
+
+
+def test_finished_rows_are_read_and_others_left_out(quick, tmp_path):
+    path = empty(tmp_path / "t.zarr")
+    with pytest.raises(HyliosError, match=r"0 finished rows of the form complex, .* at least 1"):
+        table.read_table(path)
+    table.make_chunk(str(path), STEP)
+    rows = table.read_table(path, 4)
+    assert rows.sizes["row"] == STEP
+    np.testing.assert_array_equal(rows["design"], table.design(ROWS)[0][STEP : 2 * STEP])
+    with pytest.raises(HyliosError, match=r"4 finished rows of the form complex, .* at least 5"):
+        table.read_table(path, 5)
+
+
+def test_tables_that_cannot_be_trained_on_are_refused(quick, tmp_path):
+    import zarr
+
+    path = spoilt(tmp_path / "nan.zarr", reflectance=(3, 10, np.nan))
+    with pytest.raises(HyliosError, match=r"1 of .* have no reflectance .* row 3, at 300"):
+        table.read_table(path)
+    path = spoilt(tmp_path / "design.zarr", design=(5, 4, np.inf))
+    with pytest.raises(HyliosError, match=r"1 of .* have no design .* row 5, at eumelanin"):
+        table.read_table(path)
+
+    path = spoilt(tmp_path / "box.zarr")
+    zarr.open_group(path, mode="r+")["upper"][9] = table.DESIGN[9].lower
+    with pytest.raises(HyliosError, match=r"the range of water is 0.4 to 0.4, of no width"):
+        table.read_table(path)
+
+    path = spoilt(tmp_path / "rays.zarr")
+    del zarr.open_group(path, mode="r+").attrs["rays"]
+    with pytest.raises(HyliosError, match="lacks rays"):
+        table.read_table(path)
+
+    path = spoilt(tmp_path / "cut.zarr")
+    chunk = path / "reflectance" / "c" / "1" / "0"
+    chunk.write_bytes(chunk.read_bytes()[:100])
+    with pytest.raises(HyliosError, match="is damaged"):
+        table.read_table(path)
+
+    path = spoilt(tmp_path / "growing.zarr")
+    zarr.open_group(path, mode="r+")["design"].resize((ROWS + STEP, len(table.NAMES)))
+    with pytest.raises(HyliosError, match=r"cannot be read .* --resume` mends it"):
+        table.read_table(path)
+    make(path, rows=ROWS + STEP, resume=True)
+    assert table.read_table(path).sizes["row"] == ROWS + STEP

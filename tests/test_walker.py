@@ -233,7 +233,10 @@ def test_other_company_leaves_a_wavelength_the_same(found):
     layers = S3.layers(other)
     two = tally.collect(walk(layers, jax.random.key(6)), layers, layers)
     common = np.array([0, 2])
-    part = [tally.Tally(t.rays, t.weight[common], t.weight2[common]) for t in (found, two)]
+    part = [
+        tally.Tally(t.rays, t.freedom, t.weight[common], t.weight2[common], t.common[common])
+        for t in (found, two)
+    ]
     within(*part)
 
 
@@ -326,6 +329,70 @@ def test_weights_in_single_precision_are_those_in_double(paths, layers, found):
         layers = S3.layers(NM, jnp.float64)
         double = tally.collect(wide, layers, layers)
     np.testing.assert_allclose(found.mean, double.mean, rtol=2e-3)
+
+
+# --- columns that serve a spectrum ---------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def spectrum():
+    return S3.layers(np.arange(250.0, 2501.0, 50.0))
+
+
+def test_a_plan_is_a_mixture_that_reaches_every_wavelength(spectrum):
+    plan = walker.plan(spectrum)
+    shares = np.asarray(plan.shares, float)
+    assert shares.sum() == pytest.approx(1.0, abs=1e-5)
+    assert len(shares) == sum(walker.COLUMNS) == plan.layers.mu_a.shape[1]
+    of_node = np.add.reduceat(shares, np.cumsum((0, *walker.COLUMNS[:-1])))
+    needed = np.asarray(walker.node_shares(spectrum.theta_0)).max(axis=1) > 0
+    assert np.all(of_node[needed] > 0.02)
+    # less absorption than any wavelength has, so that no weight can grow without a bound
+    assert np.all(np.asarray(plan.layers.mu_a).max(axis=1) <= np.asarray(spectrum.mu_a).max(axis=1))
+    visible = walker.plan(S3.layers(NM[:3]))
+    assert np.asarray(visible.shares)[: -walker.COLUMNS[-1]].sum() == 0
+    assert visible.layers.mu_a.shape == plan.layers.mu_a.shape
+
+
+def test_a_plan_gives_what_each_wavelengths_own_rays_give_with_a_smaller_error(spectrum):
+    own = tally.collect(walk(spectrum, jax.random.key(20)), spectrum, spectrum, own_only=True)
+    plan = walker.plan(spectrum)
+    paths = walk(plan.layers, jax.random.key(21), shares=plan.shares)
+    first = tally.collect(paths, plan.layers, spectrum, shares=plan.shares)
+    better = tally.improve(paths, plan, spectrum)
+    assert np.asarray(better.shares).sum() == pytest.approx(1.0, abs=1e-5)
+    assert np.all(np.asarray(better.shares) >= 0)
+    paths = walk(better.layers, jax.random.key(22), shares=better.shares)
+    second = tally.collect(paths, better.layers, spectrum, shares=better.shares)
+    within(first, second)
+    largest = [float(np.max(t.standard_error)) for t in (own, first, second)]
+    assert largest[0] > 1.5 * largest[1] > 1.5 * largest[2]
+    known = np.asarray(own.effective_rays) > 20  # with a few rays alone an error says little
+    assert known.sum() > 15
+    for one in (first, second):
+        spread = np.hypot(np.asarray(one.standard_error), np.asarray(own.standard_error))
+        z = (np.asarray(one.mean) - np.asarray(own.mean))[known] / spread[known]
+        assert np.all(np.abs(z) < 4.5)
+        assert stats.chi2.sf(np.sum(z**2), z.size) > 1e-4
+
+
+def test_covariance_of_a_plan_has_the_mean_and_the_errors_of_its_tally(spectrum):
+    plan = walker.plan(spectrum)
+    paths = walk(plan.layers, jax.random.key(23), shares=plan.shares)
+    mean, covariance = tally.moments(paths, plan.layers, 1.0, spectrum, plan.shares)
+    found = tally.collect(paths, plan.layers, spectrum, shares=plan.shares)
+    np.testing.assert_allclose(mean, found.mean, rtol=1e-4)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), found.standard_error, rtol=0.02)
+
+
+def test_sine_and_cosine_by_polynomials():
+    half = jnp.linspace(-math.pi / 2, math.pi / 2, 10_001, dtype=jnp.float32)
+    cos, sin = (np.asarray(x, float) for x in walker._cos_sin(half))
+    exact = 2.0 * np.asarray(half, float)
+    np.testing.assert_allclose(cos, np.cos(exact), atol=1e-6)
+    np.testing.assert_allclose(sin, np.sin(exact), atol=1e-6)
+    small = np.abs(exact) < 0.1  # a small angle keeps its relative precision
+    np.testing.assert_allclose(sin[small], np.sin(exact[small]), rtol=1e-6)
 
 
 # --- other contents from the same paths ----------------------------------------------------------
