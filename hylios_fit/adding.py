@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -32,7 +33,8 @@ from jaxtyping import Array, Float
 
 from hylios_fit import streams
 from hylios_fit.errors import HyliosError
-from hylios_fit.skin import Layers
+from hylios_fit.skin import Layers, Specimen, let_stand
+from hylios_fit.skin import layers as layers_of
 from hylios_fit.streams import SAME, Streams
 from hylios_fit.tissue import Tissue
 
@@ -287,9 +289,10 @@ def _optics(
     order: int,
 ) -> tuple[dict[str, Any], tuple[int, ...], np.ndarray]:
     """NumPy arrays for `Optics`, streams by layer, and the share reflected at once (u,)."""
-    sets = [Streams.make((outside, *row), order) for row in indices]
+    like = Streams.make((outside, *indices[0]), order)
+    sets = [Streams.make((outside, *row), order, like) for row in indices]
     counts = {tuple(st.count(n) for n in row) for st, row in zip(sets, indices, strict=True)}
-    if len(counts) > 1:
+    if len(counts) > 1 or len({st.weight.size for st in sets}) > 1:
         raise HyliosError(
             "the refractive indices of the layers change their order with the wavelength: "
             "solve such wavelengths one by one"
@@ -334,7 +337,7 @@ def _surfaces(sets, indices, outside, roughness, incidence, order) -> list[strea
     """The surface for each set of indices; interpolated where dispersion makes many of them."""
 
     def one(row):
-        st = Streams.make((outside, *row), order)
+        st = Streams.make((outside, *row), order, sets[0])
         return streams.surface(st, outside, row[0], roughness, incidence, order)
 
     if roughness <= 0 or len(indices) <= BETWEEN:
@@ -455,6 +458,74 @@ def skin(
             bottom=wide(layers.bottom),
         )
     return _run(c, tuple(kinds), index, 1.0, float(roughness), incidence, order, dtype, inner)
+
+
+MOVED = ("thickness", "mu_a", "mu_particle", "hit_albedo", "mu_fibre", "mu_tissue", "bottom")
+"""What of `Layers` a derivative can go through."""
+
+
+@lru_cache(maxsize=16)
+def _moving(names: tuple[str, ...], form: str, nm: tuple[float, ...], independent: bool, dtype):
+    """(values, x) -> what moves in the layers, each with an axis of wavelengths."""
+
+    def parts(values: dict[str, Array], x: Array) -> dict[str, Array]:
+        values = {**values, **dict(zip(names, x, strict=True))}
+        medium = layers_of(values, form, np.array(nm), dtype)
+        if not independent:
+            medium = let_stand(medium, values, form)
+        along = jnp.ones(len(nm), dtype)
+        medium = medium._replace(
+            thickness=medium.thickness[:, None] * along[None], bottom=medium.bottom * along
+        )
+        return {name: getattr(medium, name) for name in MOVED}
+
+    return jax.jit(lambda values, x: (parts(values, x), jax.jacfwd(partial(parts, values))(x)))
+
+
+def slopes(
+    specimen: Specimen,
+    wavelength_nm: np.ndarray,
+    names: Sequence[str],
+    *,
+    incidence: float = math.radians(8.0),
+    order: int = ORDER,
+    dtype: Any = None,
+    independent: bool = False,
+) -> tuple[Float[Array, "w"], Float[Array, "p w"]]:
+    """Reflectance, and its derivative by every parameter in `names`, per unit of the parameter.
+
+    A wavelength sees its own coefficients alone, so that one backward pass serves them all and
+    the cost does not grow with the number of parameters. `incidence` in radians; `independent`
+    leaves out the rejection of particles.
+    """
+    dtype = jnp.dtype(jnp.float64 if dtype is None else dtype)
+    for name in names:
+        if name.startswith("index") or name in ("roughness", "melanosome_form"):
+            raise HyliosError(
+                f"adding-doubling has no derivative in {name}: its streams depend on it"
+            )
+    nm = np.atleast_1d(np.asarray(wavelength_nm, float))
+    with jax.enable_x64(dtype == jnp.float64 or jax.config.jax_enable_x64):
+        fixed = specimen.layers(nm, dtype)
+        x = jnp.asarray(specimen.parameters(names), dtype)
+        values = {name: jnp.asarray(value, dtype) for name, value in specimen.values.items()}
+        moving = _moving(
+            tuple(names), specimen.melanosome_form, tuple(nm.tolist()), independent, dtype
+        )
+        parts, tangents = moving(values, x)
+
+        def reflectance(parts):
+            medium = fixed._replace(**parts)
+            return skin(medium, incidence=incidence, order=order, dtype=dtype).reflectance
+
+        with _blas().limit(limits=1, user_api="blas"):
+            value, pull = jax.vjp(reflectance, parts)
+            (by_part,) = jax.block_until_ready(pull(jnp.ones_like(value)))
+        total = jnp.zeros((len(names), nm.size), dtype)
+        for name in MOVED:
+            product = by_part[name][..., None] * tangents[name]  # (layer,) w p
+            total = total + jnp.sum(product.reshape(-1, nm.size, len(names)), axis=0).T
+        return value, total
 
 
 def tissue(

@@ -134,7 +134,8 @@ def accepted_share(
     does not extend itself, so that rates fall as 1/(1 + rate x dead length)), and none stands
     within its half-width of a boundary.
     """
-    crowding, width = _crowding(form)
+    with jax.ensure_compile_time_eval():  # numbers, also inside a transformation
+        crowding, width = _crowding(form)
     room = jnp.clip(1.0 - 2.0 * width * scale / thickness, 0.0, 1.0)
     return room / (1.0 + crowding * room * content)
 

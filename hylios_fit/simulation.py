@@ -197,9 +197,10 @@ def _traced(specimen, nm, surface, rays, key, angle, tolerance, independent, pro
 
 
 def _added(specimen, nm, angle, tolerance, independent) -> Curve:
-    medium = specimen.layers(nm)
-    if not independent:
-        medium = skin.let_stand(medium, specimen.values, specimen.melanosome_form)
+    with jax.enable_x64(True):
+        medium = specimen.layers(nm)
+        if not independent:
+            medium = skin.let_stand(medium, specimen.values, specimen.melanosome_form)
     orders = adding.ORDERS[adding.ORDERS.index(adding.ORDER) - 1 :]
     error = np.full(nm.shape, np.inf)
     before = None

@@ -29,12 +29,16 @@ TRAPPED = 1.0 - 1e-12  # instead of 1: light that nothing frees leaves a matrix 
 FACETS = (32, 12)
 
 
-def _panels(breaks: tuple[float, ...], order: int) -> list[tuple[float, float, int, int]]:
-    """(a, b, nodes, power of q) of every part of the range."""
+def _panels(
+    breaks: tuple[float, ...], order: int, like: Streams | None
+) -> list[tuple[float, float, int, int]]:
+    """(a, b, nodes, power of q) of every part of the range; nodes as in `like`, if given."""
     panels = []
-    for a, b in zip((0.0, *breaks[:-1]), breaks, strict=True):
+    for k, (a, b) in enumerate(zip((0.0, *breaks[:-1]), breaks, strict=True)):
         share = (b * b - a * a) / (b * b)
         nodes = order if a == 0.0 else max(3, math.ceil(1.7 * order * share**0.35))
+        if like is not None and len(like.panels) == len(breaks):
+            nodes = like.panels[k][2]
         panels.append((a, b, nodes, 1 if a == 0.0 else 2))
     return panels
 
@@ -65,12 +69,13 @@ class Streams:
         return isinstance(other, Streams) and self.panels == other.panels
 
     @classmethod
-    def make(cls, indices: tuple[float, ...], order: int) -> Streams:
+    def make(cls, indices: tuple[float, ...], order: int, like: Streams | None = None) -> Streams:
+        """Streams for media of these indices, in number as those of `like`, if given."""
         breaks: list[float] = []
         for n in sorted(indices):
             if not breaks or n > breaks[-1] + SAME:
                 breaks.append(n)
-        panels = _panels(tuple(breaks), order)
+        panels = _panels(tuple(breaks), order, like)
         weight, upper, below = [], [], []
         for a, b, n, power in panels:
             x, w = _unit_nodes(n)

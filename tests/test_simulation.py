@@ -32,7 +32,7 @@ def curves():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"method": "mcml"}, "method is one of walker, analog, surrogate"),
+        ({"method": "mcml"}, "method is one of walker, analog, adding, surrogate"),
         ({"wavelengths": [200.0]}, "250 to 2500 nm, got 200"),
         ({"wavelengths": []}, "must be a list of numbers"),
         ({"wavelengths": [np.nan]}, "250 to 2500 nm, got nan"),

@@ -1,0 +1,161 @@
+"""The deterministic solver: error by order, time of a curve, of many specimens, of slopes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import _shared
+from hylios_fit import adding, skin, tally, walker
+from hylios_fit.skin import Specimen
+from hylios_fit.table import NAMES, design
+from hylios_fit.units import wavelengths
+
+PRESETS = ("S1", "S2", "S3", "S4")
+ORDERS = (4, 6, 8, 12, 16)
+FINEST = 32
+MANY = 1000
+REPEATS = 5
+WALKS = 8  # of the slopes, for their standard error
+RAYS = 65_536
+GOAL = 1e-4
+
+
+def _timed(call: Callable[[], Any]) -> tuple[float, float]:
+    """First call, then the median of the rest, in seconds."""
+    times = []
+    for _ in range(REPEATS + 1):
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        times.append(time.perf_counter() - start)
+    return times[0], float(np.median(times[1:]))
+
+
+def run(seed: int = 0, many: int = MANY, progress: bool = True) -> dict[str, Any]:
+    from tqdm import tqdm
+
+    nm = wavelengths(250, 2500, 5)
+    result: dict[str, Any] = {"wavelengths": len(nm), "goal": GOAL, "presets": {}}
+    for name in tqdm(PRESETS, disable=not progress):
+        layers = Specimen.preset(name).layers(nm)
+        # at few wavelengths: the finest order is a matter of minutes otherwise
+        few = Specimen.preset(name).layers(nm[::15])
+        exact = np.asarray(adding.skin(few, order=FINEST).reflectance)
+        orders = {}
+        for order in ORDERS:
+            error = np.abs(np.asarray(adding.skin(few, order=order).reflectance) - exact)
+            found = {}
+            for dtype in (jnp.float64, jnp.float32):
+                first, warm = _timed(partial(adding.skin, layers, order=order, dtype=dtype))
+                found[dtype.__name__] = {"first_s": first, "s": warm}
+            orders[str(order)] = {
+                "largest_error": float(error.max()),
+                "rms_error": float(np.sqrt(np.mean(error**2))),
+                **found,
+            }
+        first, warm = _timed(
+            partial(adding.slopes, Specimen.preset(name), nm, NAMES, order=adding.ORDER)
+        )
+        result["presets"][name] = {
+            "orders": orders,
+            "slopes": {"parameters": len(NAMES), "first_s": first, "s": warm},
+        }
+    result["many"] = _many(nm, many)
+    result["slopes"] = _slopes(nm[::5], seed)
+    return result
+
+
+def _many(nm: np.ndarray, count: int) -> dict[str, Any]:
+    """Random specimens of the training design, side by side."""
+    parameters, _ = design(2 * count, 1, 1)
+    lot, took, energy = 50, 0.0, 0.0
+    for first in range(-lot, count, lot):  # one lot more, to compile
+        rows = parameters[::2][max(first, 0) : max(first, 0) + lot]
+        media = []
+        for row in rows:
+            values = {**Specimen().values, **dict(zip(NAMES, row.tolist(), strict=True))}
+            media.append(skin.layers(values, "complex", nm))
+        wide = ("index", "mu_a", "mu_particle", "hit_albedo", "theta_0", "mu_fibre", "mu_tissue")
+        together = media[0]._replace(
+            **{k: jnp.concatenate([getattr(m, k) for m in media], axis=-1) for k in wide},
+            thickness=jnp.repeat(media[0].thickness[:, None], lot * nm.size, axis=1),
+            bottom=jnp.repeat(media[0].bottom[None], lot * nm.size),
+        )
+        start = time.perf_counter()
+        found = jax.block_until_ready(adding.skin(together))
+        took += (time.perf_counter() - start) * (first >= 0)
+        energy = max(energy, float(np.max(np.asarray(found.reflectance))))
+    return {"specimens": count, "s_each": took / count, "largest_reflectance": energy}
+
+
+def _slopes(nm: np.ndarray, seed: int) -> dict[str, Any]:
+    """Slopes of the walk against the solver's, in standard errors (independent particles)."""
+    found = {}
+    for name in PRESETS:
+        specimen = Specimen.preset(name)
+        _, exact = adding.slopes(specimen, nm, NAMES, order=adding.ORDER, independent=True)
+        layers = specimen.layers(nm)
+        surface = np.asarray(adding.skin(layers).surface)
+        plan = walker.plan(layers)
+
+        def curve(x, paths, specimen=specimen, plan=plan):
+            values = {**specimen.values, **dict(zip(NAMES, x, strict=True))}
+            asked = skin.layers(values, specimen.melanosome_form, nm)
+            return tally.collect(paths, plan.layers, asked, shares=plan.shares).mean
+
+        slopes = []
+        x = jnp.asarray(specimen.parameters(NAMES), jnp.float32)
+        for number in range(WALKS):
+            paths = walker.walk(
+                plan.layers, specimen.melanosome_form,
+                jax.random.fold_in(jax.random.key(seed), number), rays=RAYS, independent=True,
+                shares=plan.shares,
+            )  # fmt: skip
+            slopes.append((1 - surface) * np.asarray(jax.jacfwd(curve)(x, paths)).T)
+        mean, error = np.mean(slopes, axis=0), np.std(slopes, axis=0, ddof=1) / np.sqrt(WALKS)
+        seen = error > 0
+        t = np.where(seen, (mean - np.asarray(exact)) / np.where(seen, error, 1.0), 0.0)
+        # Student's t with WALKS - 1 degrees of freedom has this mean square
+        expected = (WALKS - 1) / (WALKS - 3)
+        found[name] = {
+            "mean_square_t": {
+                k: float(np.mean(row[use] ** 2)) if use.any() else None
+                for k, row, use in zip(NAMES, t, seen, strict=True)
+            },
+            "expected": expected,
+        }
+    return found
+
+
+def draw(result: Mapping[str, Any], path: Any) -> None:
+    """Error against time, by order, for each specimen."""
+    figure = _shared.figure(7.0, 4.5)
+    axes = figure.subplots()
+    for i, (name, found) in enumerate(result["presets"].items()):
+        for dtype, style in (("float64", "o-"), ("float32", "s:")):
+            time_s = [o[dtype]["s"] for o in found["orders"].values()]
+            error = [o["largest_error"] for o in found["orders"].values()]
+            axes.plot(
+                time_s, error, style, ms=4, color=_shared.COLOURS[i],
+                label=f"{name}, {dtype}" if i == 0 or dtype == "float64" else None,
+            )  # fmt: skip
+    for order, o in result["presets"]["S3"]["orders"].items():
+        axes.annotate(
+            f"order {order}", (o["float64"]["s"], o["largest_error"]), fontsize=8,
+            xytext=(4, 4), textcoords="offset points",
+        )  # fmt: skip
+    axes.axhline(result["goal"], color="black", lw=0.8, ls="--")
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.legend(fontsize=8)
+    _shared.tidy(
+        axes, f"seconds for {result['wavelengths']} wavelengths, compiled",
+        "largest error of the reflectance", "adding and doubling, by order",
+    )  # fmt: skip
+    _shared.save_figure(figure, path)
