@@ -24,6 +24,7 @@ Data flows one way through the modules; each imports only from those above it:
     spectra      measured spectra: read, checked, written
     instrument   bands, specular in or out, noise
     statevector  free parameters: names, order, bounds, priors, transforms
+    planning     what a scene needs: the rest is dropped, the cheapest method taken
     training     table -> surrogate, its error measured on fresh specimens
     results      Outcome, Fit, Posterior
     inversion    spectra -> fits
@@ -61,6 +62,9 @@ _MODULE_OF = {
     "Spectra": "spectra",
     "read_spectra": "spectra",
     "as_spectra": "spectra",
+    "Scene": "planning",
+    "Plan": "planning",
+    "plan": "planning",
     "Outcome": "results",
     "Estimate": "results",
     "Fit": "results",

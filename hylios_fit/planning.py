@@ -60,7 +60,9 @@ class Scene:
     response: Any = None
     incidence: float = 8.0
     ranges: Mapping[str, tuple[float, float]] = dataclasses.field(
-        default_factory=lambda: {a.name: (a.lower, a.upper) for a in table.DESIGN}
+        default_factory=lambda: {
+            a.name: (a.lower, a.upper) for a in table.DESIGN if a.name not in STREAMS
+        }
     )
     specimen: Specimen = dataclasses.field(default_factory=Specimen)
 
@@ -394,7 +396,8 @@ def _thinned(
     known, tried = spectra[::2] - mean, spectra[1::2]
     basis = np.linalg.svd(known, full_matrices=False)[2]
     for m in range(1, min(count, len(known) - 1)):
-        columns = np.sort(qr(basis[:m], mode="economic", pivoting=True)[2][:m])
+        pivots: Any = qr(basis[:m], mode="r", pivoting=True)[1]
+        columns = np.sort(pivots[:m])
         matrix = (weights @ basis[:m].T) @ np.linalg.inv(basis[:m, columns])
         offset = weights @ mean - matrix @ mean[columns]
         missed = offset + tried[:, columns] @ matrix.T - tried @ weights.T

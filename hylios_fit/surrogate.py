@@ -31,9 +31,9 @@ from hylios_fit.errors import HyliosError
 from hylios_fit.skin import Specimen
 
 FORMAT = "hylios_fit surrogate"
-FORMAT_VERSION = 1
-FLOOR = 0.02
-"""Added to the subsurface reflectance before the logarithm: dark bands are not all noise."""
+FORMAT_VERSION = 2
+FLOOR = 0.1
+"""Added to the subsurface reflectance before the logarithm: between absolute and relative error."""
 
 # Features: log(x + offset) of what may be 0, log of what may not, the rest as it is
 OFFSETS = {
@@ -46,18 +46,34 @@ OFFSETS = {
     "blood_papillary": 0.0,
     "blood_reticular": 0.0,
 }
-LEAST_INSIDE = 0.002  # reflectance, below which the relative error is not taken
+_TOGETHER = (*OFFSETS, "oxygen_saturation")
 SLACK = 1e-5  # of the box's width, for rounding
 BLOCK = 4096  # rows of a batch of more than four blocks: what they need stays in the cache
 PRECISION = "highest"  # some accelerators multiply float32 with 10 bits unless told not to
 
 
-def features(names: tuple[str, ...], parameters: Float[Array, "... p"]) -> Float[Array, "... p"]:
-    """What the regression sees, before standardising."""
-    columns = []
-    for i, name in enumerate(names):
-        x = parameters[..., i]
-        columns.append(jnp.log(x + OFFSETS[name]) if name in OFFSETS else x)
+def features(names: tuple[str, ...], parameters: Float[Array, "... p"]) -> Float[Array, "... f"]:
+    """What the regression sees, before standardising: each parameter, and what acts together."""
+    at = {name: parameters[..., i] for i, name in enumerate(names)}
+    columns = [jnp.log(x + OFFSETS[name]) if name in OFFSETS else x for name, x in at.items()]
+    if set(_TOGETHER) <= at.keys():
+        strata = [at[f"melanosome_{stratum}"] for stratum in ("granulosum", "spinosum", "basale")]
+        colloidal, melanin = at["colloidal_melanin"], at["eumelanin"] + at["pheomelanin"]
+        content = sum(strata)
+        columns += [jnp.sqrt(x + 0.01) for x in (*strata, colloidal)]
+        columns += [
+            jnp.log(content + 0.3),
+            jnp.log(melanin),
+            jnp.log((content / 3.0 + colloidal + 0.1) * melanin),
+        ]
+        oxygen = at["oxygen_saturation"]
+        upper, lower = at["blood_papillary"], at["blood_reticular"]
+        columns += [jnp.log(upper + lower), jnp.log(0.2 * upper + lower)]
+        columns += [
+            jnp.log(blood * share + 0.02)
+            for blood in (upper, lower)
+            for share in (oxygen, 1.0 - oxygen)
+        ]
     return jnp.stack(columns, axis=-1)
 
 
@@ -73,8 +89,8 @@ class Member(eqx.Module):
     projected: bool = eqx.field(static=True)  # on an instrument's bands
     lower: Float[Array, "p"]
     upper: Float[Array, "p"]
-    centre: Float[Array, "p"]
-    scale: Float[Array, "p"]
+    centre: Float[Array, "f"]
+    scale: Float[Array, "f"]
     weights: tuple[Float[Array, "e i o"], ...]
     biases: tuple[Float[Array, "e o"], ...]
     components: Float[Array, "k c"]

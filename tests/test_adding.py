@@ -98,10 +98,9 @@ def test_reflectance_of_a_scattering_slab_is_reciprocal(x64):
     np.testing.assert_allclose(np.asarray(t), np.asarray(t).swapaxes(1, 2), atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["S2", "S4"])
-def test_orders_converge(x64, name):
-    specimen = Specimen.preset(name)
-    fine = np.asarray(solved(specimen, order=24).reflectance)
+def test_orders_converge(x64):
+    specimen = Specimen.preset("S2")
+    fine = np.asarray(solved(specimen, order=16).reflectance)
     error = [np.abs(np.asarray(solved(specimen, order=k).reflectance) - fine).max() for k in (6, 8)]
     assert error[0] < 4e-4
     assert error[1] < 1.5e-4
@@ -137,7 +136,7 @@ def test_agrees_with_the_walk_of_independent_particles():
             shares=plan.shares,
         )  # fmt: skip
         found = tally.collect(paths, plan.layers, layers, shares=plan.shares)
-        exact = adding.skin(specimen.layers(nm), order=12)
+        exact = adding.skin(specimen.layers(nm))
         share = np.asarray(exact.subsurface) / (1.0 - np.asarray(exact.surface))
         z = (np.asarray(found.mean) - share) / np.asarray(found.standard_error)
         statistic += float(z[::3] @ z[::3])  # far apart: hardly any ray serves both
@@ -294,16 +293,16 @@ def test_tissue_solver_agrees_with_its_walk(x64):
     """Random stacks with mixed indices, oblique light."""
     generator = np.random.default_rng(3)
     statistic = freedom = 0
-    for number in range(6):
-        m = 1 + number % 3
+    for number in range(4):
+        m = 1 + number % 2
         layers = Tissue(
             generator.uniform(0.01, 0.1, m), generator.uniform(1.0, 1.6, m),
             generator.uniform(0.1, 10, m), generator.uniform(5, 100, m),
             generator.uniform(-0.5, 0.9, m),
         )  # fmt: skip
-        incidence = (0.0, 0.3, 0.9)[number % 3]
+        incidence = (0.0, 0.3, 0.9, 0.0)[number]
         walked = tissue.walk(layers, jax.random.key(number), 200_000, incidence=incidence)
-        found = adding.tissue(layers, incidence=incidence, order=16)
+        found = adding.tissue(layers, incidence=incidence, order=12)
         exact = np.array(
             [float(found.subsurface[0]), float(found.bottom[0]), *np.asarray(found.absorbed)[:, 0]]
         ) / (1.0 - float(found.surface[0]))
