@@ -40,7 +40,7 @@ from hylios_fit.tissue import Tissue
 
 ORDER = 8
 """Streams for light that can leave; others in proportion. Its error on S1 to S4 is below 1e-4."""
-ORDERS = (6, 8, 12, 16, 24, 32, 48, 64)
+ORDERS = (6, 8, 12, 16, 24, 32)
 START = 2.0  # x that the Pade form of tanh(x)/x starts from
 DOUBLINGS = 24  # at most; as many are done as the thickest layer of a block needs
 OPAQUE = 1e5  # optical thickness that stands for an infinite one

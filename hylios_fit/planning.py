@@ -392,13 +392,14 @@ def _thinned(
     """
     from scipy.linalg import qr
 
+    factorise: Any = qr
     mean, count = spectra.mean(axis=0), spectra.shape[1]
     known, tried = spectra[::2] - mean, spectra[1::2]
     basis = np.linalg.svd(known, full_matrices=False)[2]
     for m in range(1, min(count, len(known) - 1)):
-        pivots: Any = qr(basis[:m], mode="r", pivoting=True)[1]
+        pivots = factorise(basis[:m], mode="r", pivoting=True)[1]
         columns = np.sort(pivots[:m])
-        matrix = (weights @ basis[:m].T) @ np.linalg.inv(basis[:m, columns])
+        matrix = np.linalg.solve(basis[:m, columns], basis[:m] @ weights.T).T
         offset = weights @ mean - matrix @ mean[columns]
         missed = offset + tried[:, columns] @ matrix.T - tried @ weights.T
         if np.max(np.abs(missed)) <= limit:

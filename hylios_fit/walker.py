@@ -634,6 +634,8 @@ class Plan(NamedTuple):
 
 
 COLUMNS = (4, 1, 1, 1, 2, 2, 2, 2, 2, 8)  # of each node of `NODES`
+LEAST_SHARE = 0.01  # of the rays, for every column that serves anything
+BETWEEN = 0.2  # for `absorb` where theta_0 falls: little is absorbed there, and rays are few
 REACH = 0.6  # how far, in the logarithm of a scattering coefficient, paths serve others well
 
 
@@ -679,8 +681,9 @@ def plan(layers: Layers, absorb: float = 0.4) -> Plan:
             # as far as the columns on both sides, which these paths help out
             near = mine[ends[max(i - 1, 0)] : ends[min(i + 2, count)] + 1]
             chosen.append(mine[at[i]])
-            mu_a.append(absorb * wide.mu_a[:, near].min(axis=1))
-            albedo.append(wide.hit_albedo[:, near].max(axis=1) ** absorb)
+            part = absorb if node in (0, len(COLUMNS) - 1) else BETWEEN
+            mu_a.append(part * wide.mu_a[:, near].min(axis=1))
+            albedo.append(wide.hit_albedo[:, near].max(axis=1) ** part)
         shares += [total[-1] / count] * count
     at = np.array(chosen)
     columns = wide._replace(
@@ -694,6 +697,9 @@ def plan(layers: Layers, absorb: float = 0.4) -> Plan:
         bottom=wide.bottom**absorb,
     )
     share = np.array(shares) / np.sum(shares)
+    # dark wavelengths too must meet what is rare in them, or their errors are not what they seem
+    share = np.where(share > 0, np.maximum(share, LEAST_SHARE), 0.0)
+    share /= share.sum()
     return Plan(Layers(*(jnp.asarray(part, dtype) for part in columns)), jnp.asarray(share, dtype))
 
 

@@ -98,3 +98,19 @@ def test_the_surrogate_is_a_method():
     assert np.allclose(curve.subsurface + curve.surface, curve.reflectance)
     with pytest.raises(HyliosError, match="8 degrees"):
         simulate(Specimen(), NM, method="surrogate", incidence=45.0)
+
+
+def test_adding_needs_no_key_and_agrees_with_the_walk(curves):
+    found = simulate(Specimen(), NM, method="adding")
+    walked = curves["plain"]
+    z = (walked.reflectance - found.reflectance) / walked.standard_error
+    assert np.all(np.abs(z) < 4)
+    assert found.standard_error.max() < 4e-4
+    assert found.note == ""
+    np.testing.assert_allclose(found.surface, walked.surface, atol=2e-6)
+
+
+def test_adding_says_what_tolerance_it_reached(monkeypatch):
+    monkeypatch.setattr(simulation.adding, "ORDERS", (6, 8))
+    found = simulate(Specimen(), NM, method="adding", tolerance=1e-12)
+    assert "tolerance 1e-12 was not reached at order 8" in found.note
