@@ -259,7 +259,7 @@ class Regression:
                         best, self.model = error, model
         else:
             self.model = MLPRegressor(
-                (64, 64), activation="tanh", solver="lbfgs", alpha=1e-5, max_iter=400,
+                hidden_layer_sizes=(64, 64), activation="tanh", solver="lbfgs", alpha=1e-5, max_iter=400,
                 random_state=seed,
             ).fit(x, scores)  # fmt: skip
 

@@ -27,7 +27,7 @@ from hylios_fit.errors import HyliosError
 from hylios_fit.simulation import Curve, check_request
 from hylios_fit.skin import LAYERS, SPECS, Layers, Specimen
 
-SPECIMENS = 64  # that are solved at every wavelength
+SPECIMENS = 128  # that are solved at every wavelength
 PROBES = 8  # of them, on which each parameter is tried
 COLUMNS = 1024  # wavelengths solved at once, so that one compiled size serves all
 STEP = 0.05  # of a range, of the differences that give the Fisher information
@@ -257,7 +257,7 @@ def plan(scene: Scene, tolerance: float) -> Plan:
     order = _order(scene, rows, tolerance / 4)
     spectra = _spectra(scene, rows, np.ones((SPECIMENS, 6)), scene.wavelength_nm, order)
     truth = spectra @ scene.weights.T
-    columns, offset, matrix = _thinned(spectra, scene.weights, tolerance / 8)
+    columns, offset, matrix = _thinned(spectra, scene.weights, tolerance / 4)
     nm = scene.wavelength_nm[columns]
 
     def bands(rows: np.ndarray, there: np.ndarray) -> np.ndarray:
@@ -387,14 +387,15 @@ def _thinned(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Few columns, and how the bands follow from them: (columns, offset (B,), matrix (B, m)).
 
-    Principal components of every other spectrum, at as many wavelengths as they are (pivoted QR);
-    the other spectra say how many are enough.
+    Principal components of three in four spectra, at as many wavelengths as they are (pivoted QR);
+    the others say how many are enough.
     """
     from scipy.linalg import qr
 
     factorise: Any = qr
     mean, count = spectra.mean(axis=0), spectra.shape[1]
-    known, tried = spectra[::2] - mean, spectra[1::2]
+    last = np.arange(len(spectra)) % 4 == 3
+    known, tried = spectra[~last] - mean, spectra[last]
     basis = np.linalg.svd(known, full_matrices=False)[2]
     for m in range(1, min(count, len(known) - 1)):
         pivots = factorise(basis[:m], mode="r", pivoting=True)[1]
