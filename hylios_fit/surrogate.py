@@ -32,8 +32,8 @@ from hylios_fit.skin import Specimen
 
 FORMAT = "hylios_fit surrogate"
 FORMAT_VERSION = 2
-FLOOR = 0.1
-"""Added to the subsurface reflectance before the logarithm: between absolute and relative error."""
+FLOOR = 0.3
+"""Added to the subsurface reflectance before the logarithm: errors are less than relative."""
 
 # Features: log(x + offset) of what may be 0, log of what may not, the rest as it is
 OFFSETS = {
@@ -98,7 +98,7 @@ class Member(eqx.Module):
     surface: Float[Array, ""]
     wavelength_nm: np.ndarray  # of the bands
     readout: Float[Array, "c b"] | None  # bands from the wavelengths; None: they are the bands
-    modes: Float[Array, "m b"]  # relative error: modes.T @ modes + diag(rest)
+    modes: Float[Array, "m b"]  # of the logarithm's error: modes.T @ modes + diag(rest)
     rest: Float[Array, "b"]
 
     def __call__(self, parameters: Float[Array, "... p"]) -> Float[Array, "... b"]:
@@ -139,13 +139,19 @@ class Member(eqx.Module):
     def error_covariance(self, reflectance: np.ndarray) -> np.ndarray:
         """Covariance (B, B) of its own error at a reflectance (B,), specular included.
 
-        The error was measured on specimens that training never saw, and is kept relative to the
-        light that comes back from inside, with which it grows.
+        The error was measured on specimens that training never saw, and is kept in the logarithm
+        that the regression was trained in.
         """
         modes = np.asarray(self.modes, float)
-        relative = modes.T @ modes + np.diag(np.asarray(self.rest, float))
-        inside = np.abs(np.asarray(reflectance, float) - float(self.surface)) + LEAST_INSIDE
-        return inside[:, None] * relative * inside
+        logarithm = modes.T @ modes + np.diag(np.asarray(self.rest, float))
+        scale = self.error_scale(reflectance)
+        return scale[:, None] * logarithm * scale
+
+    def error_scale(self, reflectance: np.ndarray) -> np.ndarray:
+        """Change of the reflectance for one of the logarithm that the regression gives."""
+        surface = float(self.surface)
+        inside = np.clip(np.asarray(reflectance, float) - surface, 0.0, None)
+        return inside + (1.0 - surface) * FLOOR
 
     def on(self, wavelength_nm: Any, response: Any = None) -> Member:
         """This member at an instrument's bands, projected once so that nothing else is computed.
@@ -199,7 +205,7 @@ class Member(eqx.Module):
         used = np.flatnonzero(w.any(axis=0))
         readout = w[:, used].T
         dtype = self.mean.dtype
-        # relative errors add up by the light that each wavelength brings
+        # errors of the logarithm add up by what it was taken of
         share = w * np.exp(np.asarray(self.mean, float))
         share = (share / share.sum(axis=1, keepdims=True)).T
         return dataclasses.replace(
@@ -509,7 +515,7 @@ def check_report(surrogate: Surrogate) -> str:
     ):
         lines.append(f"  {name:24s} {low:8.3g} to {high:.3g}")
     lines.append(f"  {'melanosome_form':24s} {' or '.join(surrogate.forms)}")
-    lines += ["", "held-out error in reflectance (RMS; Monte Carlo noise of the check taken off):"]
+    lines += ["", "held-out error in reflectance (RMS):"]
     lines.append("  wavelength (nm)     " + "".join(f"{form:>12s}" for form in surrogate.forms))
     error = {f: np.asarray(about["held_out_rms"][f]) for f in surrogate.forms}
     grid = surrogate.wavelength_nm
@@ -526,4 +532,6 @@ def check_report(surrogate: Surrogate) -> str:
     lines += ["", f"worst band:{worst[1].rstrip()} nm, {worst[0]:.4f}"]
     whole = [float(np.sqrt(np.mean(error[f] ** 2))) for f in surrogate.forms]
     lines.append("whole range           " + "".join(f"{v:12.4f}" for v in whole))
+    most = about["held_out_most"]
+    lines.append("99.9 % of all within  " + "".join(f"{most[f]:12.4f}" for f in surrogate.forms))
     return "\n".join(lines)

@@ -338,15 +338,14 @@ def stand_in(parameters, form):
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Small networks, and the stand-in for the walk also where training checks itself."""
+    """Small networks, few specimens, and the stand-in also where training checks itself."""
 
-    def fresh(surrogate, parameters, form, key):
-        number = np.array([surrogate.forms.index(form)])
-        return stand_in(parameters[None], number)[0], 1e-10 * np.eye(len(table.WAVELENGTHS))
+    def fresh(parameters, form):
+        return stand_in(parameters[None], np.array([table.FORMS.index(form)]))[0]
 
     monkeypatch.setattr(training, "fresh", fresh)
     monkeypatch.setattr(training, "HIDDEN", (16, 16))
-    monkeypatch.setattr(training, "ENSEMBLE", 2)
+    monkeypatch.setattr(training, "EPOCHS", 400)
 
 
 def filled(path, rows=512, noise=1e-4):
@@ -364,7 +363,7 @@ def filled(path, rows=512, noise=1e-4):
 
 def test_training_learns_a_smooth_table_and_states_its_error(tmp_path, quick):
     parameters, form, exact = filled(tmp_path / "table.zarr")
-    report = training.train(tmp_path / "table.zarr", tmp_path / "s.npz", progress=False)
+    report = training.train(tmp_path / "table.zarr", tmp_path / "s.npz", checks=64, progress=False)
     trained = load_surrogate(tmp_path / "s.npz")
     rows = np.column_stack([parameters, form]).astype(np.float32)
     residual = np.asarray(trained(jnp.asarray(rows))) - exact
@@ -386,14 +385,25 @@ def test_training_ignores_unfinished_rows_and_says_when_too_few(tmp_path):
     assert not (tmp_path / "s.npz").exists()
 
 
-def test_the_error_has_the_noise_of_the_check_taken_off():
+def test_the_error_is_that_of_the_check_widened_for_its_size():
     rng = np.random.default_rng(0)
-    own = rng.normal(size=(4000, 1)) * 0.01 * np.linspace(1, 2, 30)
-    noise = np.diag(np.full(30, 0.02**2))
-    seen = own + 0.02 * rng.normal(size=(4000, 30))
-    modes, rest = training._error(seen, noise, 11)
-    assert np.allclose(
-        np.sum(modes**2, axis=0) + rest, (0.01 * np.linspace(1, 2, 30)) ** 2, rtol=0.4
-    )
-    assert np.corrcoef(np.abs(modes[0]), np.linspace(1, 2, 30))[0, 1] > 0.99
+    own = rng.normal(size=(4000, 1)) * 0.01 * np.linspace(1, 2, 60)
+    seen = own + 1e-3 * rng.normal(size=(4000, 60))
+    modes, rest = training._error(seen, 11)
+    expected = (0.01 * np.linspace(1, 2, 60)) ** 2 + 1e-6
+    # each variance has a relative standard error of sqrt(2 / 4000), and all share the one mode
+    assert np.allclose(np.sum(modes**2, axis=0) + rest, expected, rtol=4 * np.sqrt(2 / 4000))
+    assert np.corrcoef(np.abs(modes[0]), np.linspace(1, 2, 60))[0, 1] > 0.99
     assert (rest > 0).all()
+    few = training._error(seen[:20], 11)
+    widened = np.sum(few[0] ** 2, axis=0) + few[1]
+    # 19 / 7 (Hartlap et al. 2007)
+    assert np.allclose(widened, 19 / 7 * np.mean(seen[:20] ** 2, axis=0), rtol=0.03)
+
+
+def test_noisy_rows_are_smoothed_by_as_much_as_their_standard_errors_say(tmp_path, quick):
+    noisy = filled(tmp_path / "noisy.zarr", noise=0.02)
+    training.train(tmp_path / "noisy.zarr", tmp_path / "n.npz", checks=8, progress=False)
+    rows = np.column_stack([noisy[0], noisy[1]]).astype(np.float32)
+    fitted = np.asarray(load_surrogate(tmp_path / "n.npz")(jnp.asarray(rows)))
+    assert np.sqrt(np.mean((fitted - noisy[2]) ** 2)) < 0.6 * 0.02

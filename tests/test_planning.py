@@ -1,0 +1,175 @@
+import jax
+import numpy as np
+import pytest
+
+import hylios_fit as hf
+from hylios_fit import planning
+from hylios_fit.skin import LAYERS, SPECS
+
+RANGES = {
+    "melanosome_basale": (0.5, 6.0),
+    "colloidal_melanin": (0.5, 3.0),
+    "blood_papillary": (0.1, 2.0),
+    "blood_reticular": (0.1, 2.0),
+    "oxygen_saturation": (0.3, 1.0),
+    "water": (0.7, 1.2),
+    "lipids": (0.3, 1.7),
+}
+NM = np.arange(400.0, 701.0, 10.0)
+CAMERA = np.stack([np.exp(-0.5 * ((NM - centre) / 30.0) ** 2) for centre in (600, 540, 450)])
+TOLERANCE = 0.005
+
+
+@pytest.fixture(scope="module")
+def camera():
+    return hf.plan(hf.Scene(NM, CAMERA, ranges=RANGES), TOLERANCE)
+
+
+@pytest.fixture(scope="module")
+def infrared():
+    scene = hf.Scene([500.0, 970.0, 1200.0, 1450.0, 1720.0, 1940.0], ranges=RANGES)
+    return hf.plan(scene, TOLERANCE)
+
+
+def fresh(scene, count):
+    """Specimens that no plan has seen."""
+    share = np.random.default_rng(5).random((count, len(scene.ranges)))
+    return [hf.Specimen(dict(zip(SPECS, row, strict=True))) for row in scene.values(share)]
+
+
+def truth(scene, specimens, order=8):
+    rows = np.array([list(specimen.values.values()) for specimen in specimens])
+    found = planning._spectra(scene, rows, np.ones((len(rows), 6)), scene.wavelength_nm, order)
+    return found @ scene.weights.T
+
+
+def test_a_camera_keeps_the_pigments_and_no_lipids(camera):
+    assert {"blood_papillary", "melanosome_basale", "oxygen_saturation"} <= set(camera.kept)
+    assert {"lipids", "water", "dna"} <= set(camera.dropped)
+    assert camera.held["lipids"] == 1.0
+    assert camera.held["dna"] == 0.0
+    every = {*RANGES, *planning.ABSENT, *LAYERS} - {"sulfhaemoglobin", "reticular_scattering"}
+    assert {*camera.kept, *camera.dropped} == every
+    assert list(camera.kept.values()) == sorted(camera.kept.values(), reverse=True)
+    assert sum(camera.dropped.values()) <= TOLERANCE / 2 <= min(camera.kept.values()) + TOLERANCE
+
+
+def test_the_infrared_keeps_water_and_lipids(infrared):
+    assert {"water", "lipids"} <= set(infrared.kept)
+    assert "water" in infrared.free
+    assert {"beta_carotene", "bilirubin"} <= set(infrared.dropped)
+
+
+def test_what_the_bands_can_tell(camera):
+    assert {"blood_papillary", "blood_reticular"} & set(camera.free)
+    assert not {"lipids", "water"} & set(camera.free)
+    assert all(0 < share < 1 for share in camera.told.values())
+    # of two that do the same one is told, of two that do not both, and nothing of what is dropped
+    same, apart = np.full((2, 2), 100.0), np.diag([50.0, 100.0])
+    assert list(planning._told(same, ("a", "b"), [])) == ["a"]
+    assert planning._told(apart, ("a", "b"), []) == pytest.approx({"b": 101**-0.5, "a": 51**-0.5})
+    assert list(planning._told(apart, ("a", "b"), ["b"])) == ["a"]
+    assert planning._told(apart / 1e4, ("a", "b"), []) == {}
+
+
+@pytest.mark.parametrize("name", ["camera", "infrared"])
+def test_what_is_dropped_changes_fresh_specimens_by_less_than_the_tolerance(name, request):
+    plan = request.getfixturevalue(name)
+    assert plan.error <= 0.75 * TOLERANCE
+    specimens = fresh(plan.scene, 16)
+    rows = np.array([list(specimen.values.values()) for specimen in specimens])
+    rows, there = planning._without(rows, plan.held, plan.clear)
+    found = planning._spectra(plan.scene, rows, there, plan.wavelength_nm, plan.order)
+    missed = plan.offset + found @ plan.matrix.T - truth(plan.scene, specimens)
+    assert 0 < np.abs(missed).max() <= TOLERANCE
+
+
+def test_the_plan_meets_the_tolerance(camera):
+    specimens = fresh(camera.scene, 8)
+    found = np.stack([camera.simulate(specimen).reflectance for specimen in specimens])
+    assert np.abs(found - truth(camera.scene, specimens)).max() <= TOLERANCE
+
+
+def test_few_wavelengths_stand_for_all(camera):
+    assert len(camera.wavelength_nm) < len(NM)
+    # of a spectrum that is 1 everywhere every band is 1, to within what the wavelengths miss
+    rng = np.random.default_rng(0)
+    spectra = 0.5 + rng.normal(size=(64, 3)) @ np.stack([np.ones(31), NM / 700, (NM / 700) ** 2])
+    columns, offset, matrix = planning._thinned(spectra, camera.scene.weights, 1e-9)
+    assert len(columns) == 3
+    np.testing.assert_allclose(
+        offset + spectra[:, columns] @ matrix.T, spectra @ camera.scene.weights.T, atol=1e-9
+    )
+
+
+def test_a_curve_with_its_error(camera):
+    specimen = fresh(camera.scene, 1)[0]
+    curve = camera.simulate(specimen)
+    np.testing.assert_array_equal(curve.reflectance, camera.reflectance([specimen])[0])
+    np.testing.assert_allclose(curve.surface + curve.subsurface, curve.reflectance)
+    assert (curve.standard_error == camera.error).all()
+    assert curve.method == camera.method
+    np.testing.assert_allclose(curve.wavelength_nm, (600, 540, 450), atol=8.0)
+
+
+def test_it_can_be_read(camera):
+    text = str(camera)
+    for part in ("3 bands, 400 to 700 nm", "0.005", "lipids", "held at 1", "left out", "can tell"):
+        assert part in text
+
+
+def test_the_names_to_fit_are_those_of_the_surrogate(camera):
+    names = hf.load_surrogate().names
+    assert set(camera.free) <= set(names)
+
+
+def test_specimens_that_the_scene_does_not_speak_of(camera):
+    specimen = fresh(camera.scene, 1)[0]
+    with pytest.raises(hf.HyliosError, match=r"water = 1.3 \(planned for 0.7 to 1.2\)"):
+        camera.simulate(specimen.replace(water=1.3))
+    with pytest.raises(hf.HyliosError, match="thickness_papillary"):
+        camera.simulate(specimen.replace(thickness_papillary=0.03))
+    with pytest.raises(hf.HyliosError, match="melanosome_form"):
+        camera.simulate(specimen.replace(melanosome_form="dispersed"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"wavelength_nm": [100.0]}, "250 to 2500"),
+        ({"wavelength_nm": [500.0, 400.0]}, "rising"),
+        ({"wavelength_nm": NM, "response": np.ones((3, 5))}, r"\(bands, 31\)"),
+        ({"wavelength_nm": NM, "response": -np.ones(31)}, "none below 0"),
+        ({"wavelength_nm": NM, "response": np.zeros(31)}, "above 0 in each band"),
+        ({"wavelength_nm": NM, "ranges": {}}, "at least one"),
+        ({"wavelength_nm": NM, "ranges": {"watr": (0, 1)}}, "did you mean water"),
+        ({"wavelength_nm": NM, "ranges": {"water": (0, 9)}}, "water must lie in"),
+        ({"wavelength_nm": NM, "ranges": {"water": (1, 1)}}, "of no width"),
+        ({"wavelength_nm": NM, "ranges": {"roughness": (0, 0.2)}}, "cannot vary"),
+        ({"wavelength_nm": NM, "incidence": 95.0}, "0 to 85"),
+    ],
+)
+def test_scenes_that_cannot_be(arguments, message):
+    with pytest.raises(hf.HyliosError, match=message):
+        hf.Scene(**arguments)
+
+
+@pytest.mark.parametrize("tolerance", [0.0, -1.0, 1.0, np.nan])
+def test_tolerances_that_cannot_be(tolerance):
+    with pytest.raises(hf.HyliosError, match="tolerance"):
+        hf.plan(hf.Scene(NM), tolerance)
+
+
+def test_what_is_no_scene():
+    with pytest.raises(hf.HyliosError, match="expected a Scene"):
+        hf.plan(NM, 0.01)  # pyright: ignore[reportArgumentType]
+
+
+def test_side_by_side_is_one_after_the_other(camera):
+    specimens = fresh(camera.scene, 3)
+    rows = np.array([list(specimen.values.values()) for specimen in specimens])
+    together = planning.side_by_side(rows, "complex", NM)
+    one = specimens[2].layers(NM)
+    np.testing.assert_allclose(together.mu_a[:, -31:], one.mu_a, rtol=1e-5)
+    np.testing.assert_allclose(together.thickness[:, -1], one.thickness, rtol=1e-6)
+    assert isinstance(together.mu_a, jax.Array)
