@@ -312,7 +312,7 @@ def draw(result: dict[str, Any], path: Any) -> None:
             part = covered[quantity]["informed"]
             told = "none informed"
             if part["n"]:
-                told = f"{part['in_68']} of {part['n']} informed held"
+                told = f"{part['in_68']} of {part['n']} held"
             label = LABELS[quantity]
             _shared.tidy(panel, f"true {label}", f"estimated {label}", f"{name} nm: {told}")
     _shared.save_figure(figure, path)

@@ -166,9 +166,12 @@ def _solve(c: Coefficients, optics: Optics, which: Array, kinds, counts, inner: 
         return jnp.moveaxis(a.reshape(shape), axis, 0)
 
     wide = Coefficients(
-        *(blocks(a, 1) for a in c[:4]),
-        tuple(None if a is None else blocks(a, 0) for a in c.moments),
-        blocks(c.bottom, 0),
+        thickness=blocks(c.thickness, 1),
+        extinction=blocks(c.extinction, 1),
+        scattering=blocks(c.scattering, 1),
+        once=blocks(c.once, 1),
+        moments=tuple(None if a is None else blocks(a, 0) for a in c.moments),
+        bottom=blocks(c.bottom, 0),
     )
 
     def one(block):
@@ -363,6 +366,11 @@ def _surfaces(sets, indices, outside, roughness, incidence, order) -> list[strea
     return [streams.Surface(*row) for row in zip(*parts, strict=True)]
 
 
+def _precision(dtype: Any) -> Any:
+    """Double precision where it is asked for, and where JAX is set to it."""
+    return jax.enable_x64(np.float64 in (dtype, jax.dtypes.canonicalize_dtype(np.float64)))
+
+
 def _concrete(name: str, value: Any) -> np.ndarray:
     if isinstance(value, Tracer):
         raise HyliosError(
@@ -389,7 +397,7 @@ def _run(c, kinds, index, outside, roughness, incidence, order, dtype, inner) ->
     which = which.reshape(-1)
     if which.size == 1 or np.all(which == 0):
         which = np.zeros(c.extinction.shape[1], int)
-    with jax.enable_x64(dtype == jnp.float64 or jax.config.jax_enable_x64):
+    with _precision(dtype):
         optics = jax.tree.map(lambda a: jnp.asarray(a, dtype), Optics(**arrays))
         c = jax.tree.map(lambda a: jnp.asarray(a, dtype), c)
         place = jnp.asarray(which, jnp.int32)
@@ -437,7 +445,7 @@ def skin(
     theta_0 = _concrete("theta_0", layers.theta_0)
     angles, place = np.unique(theta_0, return_inverse=True)
     top = Streams.make((1.0, *index[:, 0]), order).weight.size
-    with jax.enable_x64(dtype == jnp.float64 or jax.config.jax_enable_x64):
+    with _precision(dtype):
         chi = jnp.asarray(streams.exponential_moments(tuple(angles), 2 * top)[place], dtype)
         isotropic = jnp.zeros_like(chi).at[:, 0].set(1.0)
 
@@ -505,7 +513,7 @@ def slopes(
                 f"adding-doubling has no derivative in {name}: its streams depend on it"
             )
     nm = np.atleast_1d(np.asarray(wavelength_nm, float))
-    with jax.enable_x64(dtype == jnp.float64 or jax.config.jax_enable_x64):
+    with _precision(dtype):
         fixed = specimen.layers(nm, dtype)
         x = jnp.asarray(specimen.parameters(names), dtype)
         values = {name: jnp.asarray(value, dtype) for name, value in specimen.values.items()}
@@ -544,7 +552,7 @@ def tissue(
     kinds = tuple("scatter" if _present(layers.mu_s[i]) else "clear" for i in range(m))
     every = np.concatenate([index, [below]])
     top = Streams.make((above, *every), order).weight.size
-    with jax.enable_x64(dtype == jnp.float64 or jax.config.jax_enable_x64):
+    with _precision(dtype):
         mu_a, mu_s, g, h = (
             jnp.asarray(v, dtype) for v in (layers.mu_a, layers.mu_s, layers.g, layers.thickness)
         )

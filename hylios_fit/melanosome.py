@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import math
 from functools import lru_cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -90,17 +91,20 @@ def _crowding(form: str) -> tuple[float, float]:
     """
     from scipy.stats import qmc
 
+    a: Any
+    b: Any
     a, b = semi_axes(form)
     if form != "dispersed":
         a = b = sphere_radius(form)
-    unit = qmc.Sobol(8, rng=np.random.default_rng(0)).random(4096)
+    unit: Any = qmc.Sobol(8, rng=np.random.default_rng(0)).random(4096)
     unit = np.clip(unit, 1e-9, 1.0 - 1e-9)
     found = []
     for u in (unit[:, :4], unit[:, 4:]):
-        cos = np.asarray(axis_cosine(a, b, u[:, 0])) if b > a else np.ones(len(u))
+        cos: Any = np.asarray(axis_cosine(a, b, u[:, 0])) if b > a else np.ones(len(u))
         sin = np.sqrt(1.0 - cos**2)
         azimuth, beta = 2.0 * np.pi * u[:, 1], 2.0 * np.pi * u[:, 2]
-        entry = entry_point(a, b, cos, np.sqrt(u[:, 3]), (np.cos(azimuth), np.sin(azimuth)))
+        turned: Any = (np.cos(azimuth), np.sin(azimuth))
+        entry = entry_point(a, b, cos, np.sqrt(u[:, 3]), turned)
         g, along, k = (-np.asarray(part) for part in entry)
         cb, sb = np.cos(beta), np.sin(beta)
         found.append(

@@ -166,13 +166,13 @@ def _fit(
     from sklearn.neural_network import MLPRegressor
     from sklearn.preprocessing import StandardScaler
 
-    scaler = StandardScaler().fit(x)
-    pca = PCA(min(COMPONENTS, len(x) // 4), random_state=seed).fit(log)
+    scaler: Any = StandardScaler().fit(x)
+    pca: Any = PCA(min(COMPONENTS, len(x) // 4), random_state=seed).fit(log)
     scores = pca.transform(log)
     unit = scores[:, 0].std()  # one scale for all, so that what matters more weighs more
     # the most probable weights, where they have variance 1/width and each score this much noise
     variance = np.mean(np.sum(noise**2, axis=1)) / unit**2 / scores.shape[1]
-    batch = min(BATCH, len(x))
+    batch: Any = min(BATCH, len(x))
     network = MLPRegressor(
         hidden_layer_sizes=HIDDEN, activation="tanh", solver="adam", batch_size=batch,
         alpha=variance * max(HIDDEN) * batch / len(x),  # the penalty is added in every batch
