@@ -1,6 +1,6 @@
 """The surrogate: parameters -> reflectance spectrum, in JAX, within the range it was trained on.
 
-One `Member` for each melanosome form: standardised features, a small ensemble of perceptrons that
+One `Member` for each melanosome form: standardised features, a perceptron (or an ensemble) that
 gives the scores of the principal components (trained by scikit-learn in `training`), and the way
 back to reflectance. It knows its training box and the covariance of its own error, measured on
 specimens that it never saw. Its file is a plain .npz without pickle.

@@ -15,7 +15,10 @@ from hylios_fit.errors import HyliosError
 from hylios_fit.skin import Specimen
 from hylios_fit.spectra import write_csv
 
-NAMES = ("walker_analog", "nist", "issa", "recovery")
+NAMES = (
+    "walker_analog", "nist", "issa", "recovery", "witnesses", "adding_speed", "tissue_speed",
+    "walker_speed", "surrogate_speed", "speed_accuracy", "plan",
+)  # fmt: skip
 
 
 @pytest.fixture
