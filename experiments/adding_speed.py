@@ -20,8 +20,8 @@ from hylios_fit.units import wavelengths
 PRESETS = ("S1", "S2", "S3", "S4")
 ORDERS = (4, 6, 8, 12, 16)
 FINEST = 32
-MANY = 1000
-REPEATS = 5
+MANY = 500
+REPEATS = 3
 WALKS = 8  # of the slopes, for their standard error
 RAYS = 65_536
 GOAL = 1e-4

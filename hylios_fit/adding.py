@@ -388,29 +388,42 @@ def _blas() -> Any:
     return ThreadpoolController()
 
 
-def _run(c, kinds, index, outside, roughness, incidence, order, dtype, inner) -> Solution:
-    """index: (m + open, w) in float64, concrete."""
+def _ready(c, kinds, index, outside, roughness, incidence, order, dtype):
+    """(c, optics, which set of them, streams by layer, share reflected at once) for `_solve`.
+
+    index: (m + open, w) in float64, concrete.
+    """
     columns, which = np.unique(np.round(index, 12), axis=1, return_inverse=True)
     arrays, counts, at_once = _optics(
         tuple(map(tuple, columns.T.tolist())), kinds, outside, roughness, incidence, order
     )
-    which = which.reshape(-1)
-    if which.size == 1 or np.all(which == 0):
-        which = np.zeros(c.extinction.shape[1], int)
+    which = np.broadcast_to(which.reshape(-1), c.extinction.shape[1:])
+    optics = jax.tree.map(lambda a: jnp.asarray(a, dtype), Optics(**arrays))
+    c = jax.tree.map(lambda a: jnp.asarray(a, dtype), c)
+    return c, optics, jnp.asarray(which, jnp.int32), counts, jnp.asarray(at_once[which], dtype)
+
+
+def _run(c, kinds, index, outside, roughness, incidence, order, dtype, inner) -> Solution:
     with _precision(dtype):
-        optics = jax.tree.map(lambda a: jnp.asarray(a, dtype), Optics(**arrays))
-        c = jax.tree.map(lambda a: jnp.asarray(a, dtype), c)
-        place = jnp.asarray(which, jnp.int32)
+        c, optics, which, counts, at = _ready(
+            c, kinds, index, outside, roughness, incidence, order, dtype
+        )
         # threads of the linear algebra wait for each other on matrices this small
         with _blas().limit(limits=1, user_api="blas"):
             out, absorbed, bottom = jax.block_until_ready(
-                _solve(c, optics, place, kinds, counts, inner)
+                _solve(c, optics, which, kinds, counts, inner)
             )
-        at = jnp.asarray(at_once[which], dtype)
         entered = 1.0 - at
         if inner:
             absorbed, bottom = entered[None] * absorbed, entered * bottom
         return Solution(at + entered * out, at, entered * out, absorbed, bottom)
+
+
+@partial(jax.jit, static_argnames=("kinds", "counts"))
+def _solve_back(c: Coefficients, optics: Optics, which: Array, kinds, counts):
+    """What comes back (w,), and its derivative by every coefficient of its own wavelength."""
+    out, pull = jax.vjp(lambda c: _solve(c, optics, which, kinds, counts, False)[0], c)
+    return out, pull(jnp.ones_like(out))[0]
 
 
 def skin(
@@ -428,12 +441,18 @@ def skin(
     concrete. A specimen's scalars (`thickness`, `bottom`) may carry an axis of wavelengths.
     """
     dtype = jnp.dtype(jnp.float64 if dtype is None else dtype)
+    _check(order, incidence)
+    c, kinds, index, roughness = _of_skin(layers, order, dtype)
+    return _run(c, kinds, index, 1.0, roughness, incidence, order, dtype, inner)
+
+
+def _of_skin(layers: Layers, order: int, dtype: Any):
+    """(coefficients, kind of each layer, indices, roughness)."""
     w = layers.mu_a.shape[1]
     index, roughness = (
         _concrete("the indices", layers.index),
         _concrete("the roughness", layers.roughness),
     )
-    _check(order, incidence)
     kinds = ["clear"] * 6
     for i in (1, 2, 3):
         if _present(layers.mu_particle[i]):
@@ -465,7 +484,7 @@ def skin(
             moments=(None, chi, chi, chi, None, isotropic),
             bottom=wide(layers.bottom),
         )
-    return _run(c, tuple(kinds), index, 1.0, float(roughness), incidence, order, dtype, inner)
+    return c, tuple(kinds), index, float(roughness)
 
 
 MOVED = ("thickness", "mu_a", "mu_particle", "hit_albedo", "mu_fibre", "mu_tissue", "bottom")
@@ -522,18 +541,26 @@ def slopes(
         )
         parts, tangents = moving(values, x)
 
-        def reflectance(parts):
-            medium = fixed._replace(**parts)
-            return skin(medium, incidence=incidence, order=order, dtype=dtype).reflectance
-
+        c, kinds, index, roughness = _of_skin(fixed._replace(**parts), order, dtype)
+        c, optics, which, counts, at = _ready(
+            c, kinds, index, 1.0, roughness, incidence, order, dtype
+        )
         with _blas().limit(limits=1, user_api="blas"):
-            value, pull = jax.vjp(reflectance, parts)
-            (by_part,) = jax.block_until_ready(pull(jnp.ones_like(value)))
+            out, by = jax.block_until_ready(_solve_back(c, optics, which, kinds, counts))
+        by_part = {
+            "thickness": by.thickness,
+            "mu_a": by.extinction,
+            "mu_particle": by.extinction + by.scattering * parts["hit_albedo"],
+            "hit_albedo": by.scattering * parts["mu_particle"],
+            "mu_fibre": by.once[4],
+            "mu_tissue": by.extinction + by.scattering,
+            "bottom": by.bottom,
+        }
         total = jnp.zeros((len(names), nm.size), dtype)
         for name in MOVED:
             product = by_part[name][..., None] * tangents[name]  # (layer,) w p
             total = total + jnp.sum(product.reshape(-1, nm.size, len(names)), axis=0).T
-        return value, total
+        return at + (1.0 - at) * out, (1.0 - at)[None] * total
 
 
 def tissue(
