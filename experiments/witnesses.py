@@ -182,7 +182,7 @@ def draw(result: Mapping[str, Any], path: Any) -> None:
     )  # fmt: skip
     z = points["z"][np.isfinite(points["z"])]
     x = np.linspace(-4.5, 4.5, 200)
-    spread.hist(z, 45, (-4.5, 4.5), density=True, color=_shared.COLOURS[0], alpha=0.6)
+    spread.hist(z, 45, range=(-4.5, 4.5), density=True, color=_shared.COLOURS[0], alpha=0.6)
     spread.plot(x, norm.pdf(x), color=_shared.COLOURS[1], label="normal")
     spread.legend(fontsize=8)
     _shared.tidy(spread, "difference (standard errors)", "density")
