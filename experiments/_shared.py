@@ -17,7 +17,7 @@ import hylios_fit
 REPOSITORY = Path(__file__).resolve().parents[1]
 CACHE = REPOSITORY / "build" / "experiments"
 """Checkpoints and downloads; git ignores `build`."""
-WALK = ("absorbers", "fresnel", "melanosome", "scattering", "skin", "tally", "walker")
+WALK = ("absorbers", "counter", "fresnel", "melanosome", "scattering", "skin", "tally", "walker")
 FITTING = ("instrument", "inversion", "spectra", "statevector", "surrogate")
 
 COLOURS = ("#1b6ca8", "#c8553d", "#3a7d44", "#7a4fa3", "#b58900", "#4d4d4d", "#d1495b", "#2a9d8f")

@@ -26,6 +26,7 @@ from hylios_fit import adding, fresnel, melanosome, skin, streams, table
 from hylios_fit.simulation import simulate
 from hylios_fit.skin import SPECS, Layers, Specimen
 from hylios_fit.surrogate import FLOOR, features, load_surrogate
+from hylios_fit.threads import one_blas_thread
 
 NUMBER = 16
 TRUTH = 24
@@ -356,8 +357,6 @@ def rms(found: np.ndarray, truth: np.ndarray) -> float:
 
 def run(seed: int = 0, table_path: str | None = None) -> dict[str, Any]:
     """Error by regime and time for every method; what is done already is kept."""
-    from threadpoolctl import threadpool_limits
-
     base = {"seed": seed, "regimes": {n: [dict(r[0]), r[2].tolist()] for n, r in REGIMES.items()}}
     exact = _Parts(TRANSPORT, **base)
     truth = {
@@ -379,7 +378,7 @@ def run(seed: int = 0, table_path: str | None = None) -> dict[str, Any]:
     methods: list[dict[str, Any]] = []
     _walks(exact, seed, truth, methods)
     _deterministic(exact, seed, truth, methods)
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         about = _from_table(base, seed, table_path, truth, methods)
         about |= _embedded(base, seed, truth, methods)
     return {

@@ -152,7 +152,7 @@ def _changes(key: jax.Array, repeats: int, thinner: int) -> dict[str, float]:
     found = {"as it is": rate()}
     with _replaced("_cos_pi", lambda x: jnp.cos(np.float32(np.pi) * x)):
         found["jnp.cos"] = rate()
-    with _replaced("_words", library):
+    with _replaced("pcg4d", library):
         found["jax.random"] = rate()
     with _replaced("_pick", gathered):
         found["gather"] = rate()

@@ -4,6 +4,8 @@ Data flows one way through the modules; each imports only from those above it:
 
     errors       the one exception for unusable input
     units        the unit system and its conversions at the edges
+    threads      linear algebra held to one thread
+    counter      random words from a counter
     datasets     find, read and check what is in data/
     absorbers    specific absorption spectra
     fresnel      interfaces: reflectance, refraction, critical angle

@@ -36,6 +36,7 @@ from hylios_fit.errors import HyliosError
 from hylios_fit.skin import Layers, Specimen, let_stand
 from hylios_fit.skin import layers as layers_of
 from hylios_fit.streams import SAME, Streams
+from hylios_fit.threads import one_blas_thread
 from hylios_fit.tissue import Tissue
 
 ORDER = 8
@@ -380,14 +381,6 @@ def _concrete(name: str, value: Any) -> np.ndarray:
     return np.asarray(value, np.float64)
 
 
-@lru_cache(maxsize=1)
-def _blas() -> Any:
-    import scipy.linalg  # noqa: F401  # brings the library that XLA solves with
-    from threadpoolctl import ThreadpoolController
-
-    return ThreadpoolController()
-
-
 def _ready(c, kinds, index, outside, roughness, incidence, order, dtype):
     """(c, optics, which set of them, streams by layer, share reflected at once) for `_solve`.
 
@@ -408,8 +401,7 @@ def _run(c, kinds, index, outside, roughness, incidence, order, dtype, inner) ->
         c, optics, which, counts, at = _ready(
             c, kinds, index, outside, roughness, incidence, order, dtype
         )
-        # threads of the linear algebra wait for each other on matrices this small
-        with _blas().limit(limits=1, user_api="blas"):
+        with one_blas_thread():
             out, absorbed, bottom = jax.block_until_ready(
                 _solve(c, optics, which, kinds, counts, inner)
             )
@@ -545,7 +537,7 @@ def slopes(
         c, optics, which, counts, at = _ready(
             c, kinds, index, 1.0, roughness, incidence, order, dtype
         )
-        with _blas().limit(limits=1, user_api="blas"):
+        with one_blas_thread():
             out, by = jax.block_until_ready(_solve_back(c, optics, which, kinds, counts))
         by_part = {
             "thickness": by.thickness,

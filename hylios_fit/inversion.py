@@ -31,12 +31,12 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
-from threadpoolctl import threadpool_limits
 
 from hylios_fit import instrument, statevector
 from hylios_fit.errors import HyliosError
 from hylios_fit.results import MISSING, QUANTITIES, Estimate, Fit, Outcome
 from hylios_fit.spectra import Spectra, as_spectra
+from hylios_fit.threads import one_blas_thread
 
 MAX_STEPS = 100
 TOLERANCE = 1e-5
@@ -128,8 +128,7 @@ def fit_many(
         from hylios_fit.surrogate import load_surrogate
 
         surrogate = load_surrogate()
-    # Threads gain nothing on matrices of this size, and wait on each other where cores are few.
-    with jax.enable_x64(True), threadpool_limits(1, user_api="blas"):
+    with jax.enable_x64(True), one_blas_thread():
         job = _job(spectra, surrogate, noise, free, fix, specular, starts, key)
         order = range(len(spectra))
         if progress:

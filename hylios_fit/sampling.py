@@ -22,11 +22,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from threadpoolctl import threadpool_limits
 
 from hylios_fit import instrument, inversion, statevector
 from hylios_fit.errors import HyliosError
 from hylios_fit.results import QUANTITIES, Fit, Posterior
+from hylios_fit.threads import one_blas_thread
 
 ENSEMBLES = 2
 ENOUGH = 50
@@ -84,7 +84,7 @@ def sample(
         from hylios_fit.surrogate import load_surrogate
 
         surrogate = load_surrogate()
-    with jax.enable_x64(True), threadpool_limits(1, user_api="blas"):
+    with jax.enable_x64(True), one_blas_thread():
         vector, density = log_posterior(fit, surrogate)
         chains, acceptance = _run(fit, density, key, walkers, steps, progress)
         return _posterior(fit, vector, chains, acceptance, key)

@@ -163,8 +163,8 @@ def walk_rows(
     asked = coefficients(jnp.asarray(parameters, jnp.float32))
     # groups in turn, so that long and short rays share the lanes
     bits = jax.random.bits(key, (count,), jnp.uint32)
-    theta_0 = walked.theta_0[0]
-    own = np.stack([walker.choose_heroes(theta_0, b[None], 0, rays) for b in bits], axis=1)
+    shares = walker.hero_shares(walked.theta_0[0])
+    own = np.stack([walker.spread(shares, b[None], 0, rays) for b in bits], axis=1)
     paths = walker.walk(
         _side_by_side(walked),
         form,

@@ -26,6 +26,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int, Key
 
 from hylios_fit import fresnel
+from hylios_fit.counter import pcg4d
 from hylios_fit.errors import HyliosError
 
 _RANGES = {  # lower, upper, whether the ends belong, what it is called in an error
@@ -219,21 +220,6 @@ class _Lanes(NamedTuple):
     interactions: Array
 
 
-def _words(lane: Array, step: Array, key: Array) -> list[Array]:
-    """Four random words from a counter: the hash pcg4d (Jarzynski and Olano 2020)."""
-    y = jnp.broadcast_to(step, lane.shape)
-    v = [lane, y, lane ^ key[0], y ^ key[1]]
-    v = [u * jnp.uint32(1664525) + jnp.uint32(1013904223) for u in v]
-    for last in (False, True):
-        v[0] = v[0] + v[1] * v[3]
-        v[1] = v[1] + v[2] * v[0]
-        v[2] = v[2] + v[0] * v[1]
-        v[3] = v[3] + v[1] * v[2]
-        if not last:
-            v = [u ^ (u >> 16) for u in v]
-    return v
-
-
 def _unit(word: Array, dtype: Any) -> Array:
     """A uniform number in (0, 1] from a word; only rounding reaches 1."""
     return word.astype(dtype) * dtype.type(2.0**-32) + dtype.type(2.0**-33)
@@ -262,7 +248,7 @@ def _pick(table: Array, passed: list[Array]) -> Array:
 def _step(s: _Lanes, stack: _Stack, step: Array, key: Array) -> _Lanes:
     """Every lane one flight on: to an interaction or to an interface between slabs."""
     dtype = s.depth.dtype
-    words = _words(s.lane, step, key)
+    words = pcg4d(s.lane, step, key)
     u1, u2, u3 = (_unit(word, dtype) for word in words[:3])
     slabs = stack.index.shape[0] - 2
 

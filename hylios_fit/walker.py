@@ -31,6 +31,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from hylios_fit import fresnel, melanosome, scattering
+from hylios_fit.counter import pcg4d
 from hylios_fit.skin import LAYERS, STRATA, Layers
 
 # What is summed along a path, in this order
@@ -90,18 +91,9 @@ class _Medium(NamedTuple):
 
 
 def _uniform(ray: Array, step: Array, stream: int, key: Array, dtype: Any) -> list[Array]:
-    """Four uniform numbers in (0, 1) from a counter: the hash pcg4d (Jarzynski and Olano 2020)."""
-    x = ray.astype(jnp.uint32)
-    y = jnp.broadcast_to(step.astype(jnp.uint32) * jnp.uint32(8) + jnp.uint32(stream), x.shape)
-    v = [x, y, x ^ key[0], y ^ key[1]]
-    v = [u * jnp.uint32(1664525) + jnp.uint32(1013904223) for u in v]
-    for last in (False, True):
-        v[0] = v[0] + v[1] * v[3]
-        v[1] = v[1] + v[2] * v[0]
-        v[2] = v[2] + v[0] * v[1]
-        v[3] = v[3] + v[1] * v[2]
-        if not last:
-            v = [u ^ (u >> 16) for u in v]
+    """Four uniform numbers in (0, 1) for each ray, step and stream."""
+    number = step.astype(jnp.uint32) * jnp.uint32(8) + jnp.uint32(stream)
+    v = pcg4d(ray.astype(jnp.uint32), number, key)
     if dtype == jnp.float32:
         # 23 bits below the 1 of a float in [1, 2), then the middle of each step
         v = [jax.lax.bitcast_convert_type((u >> 9) | jnp.uint32(0x3F800000), dtype) for u in v]
@@ -609,11 +601,6 @@ def hero_shares(theta_0: Float[Array, "w"]) -> Float[Array, "w"]:
     falling = (theta_0 > 0) & (theta_0 < 0.999 * scattering.LATIMER_ANGLE)
     weight = jnp.where(falling, 2.5, jnp.where(theta_0 > 0, 1.0, 0.35)).astype(theta_0.dtype)
     return weight / jnp.sum(weight)
-
-
-def choose_heroes(theta_0: Array, bits: Array, first: int, rays: int) -> np.ndarray:
-    """Column of each ray, by `hero_shares`."""
-    return spread(hero_shares(theta_0), bits, first, rays)
 
 
 def spread(shares: Array, bits: Array, first: int, rays: int) -> np.ndarray:

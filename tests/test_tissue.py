@@ -10,6 +10,7 @@ from scipy import stats
 
 import hylios_fit
 from hylios_fit import tissue
+from hylios_fit.counter import pcg4d
 from hylios_fit.errors import HyliosError
 from hylios_fit.tissue import Tissue, Totals, walk
 
@@ -288,7 +289,7 @@ def test_the_cosine_of_the_azimuth(dtype):
 
 def numbers(dtype, first=0, step=0, key=(1, 2), count=1 << 16):
     lane = jnp.arange(count, dtype=jnp.uint32) + jnp.uint32(first)
-    words = tissue._words(lane, jnp.uint32(step), jnp.asarray(key, jnp.uint32))
+    words = pcg4d(lane, jnp.uint32(step), jnp.asarray(key, jnp.uint32))
     return [np.asarray(tissue._unit(word, dtype), float) for word in words[:3]]
 
 
@@ -316,7 +317,7 @@ def test_the_numbers_of_one_lane_are_uniform_and_independent(dtype):
     steps = jnp.arange(1 << 16, dtype=jnp.uint32)
     for lane in (0, 7, 4095):
         lanes = jnp.full(steps.shape, lane, jnp.uint32)
-        words = tissue._words(lanes, steps, jnp.asarray([11, 12], jnp.uint32))[:3]
+        words = pcg4d(lanes, steps, jnp.asarray([11, 12], jnp.uint32))[:3]
         own = [np.asarray(tissue._unit(word, dtype), float) for word in words]
         for x in own:
             counts, _ = np.histogram(x, 256, (0, 1))

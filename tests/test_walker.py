@@ -273,7 +273,7 @@ def test_heroes_are_spread_as_stated():
     assert shares.sum() == pytest.approx(1.0)
     bits = jax.random.bits(jax.random.key(8), (2,), jnp.uint32)
     for first, rays in ((0, 1000), (1000, 1000)):
-        heroes = walker.choose_heroes(theta_0, bits, first, rays)
+        heroes = walker.spread(walker.hero_shares(theta_0), bits, first, rays)
         found = np.bincount(heroes, minlength=4) / rays
         np.testing.assert_allclose(found, shares, atol=5e-3)
 
