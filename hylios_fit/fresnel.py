@@ -6,7 +6,9 @@ Directions are unit vectors with z pointing into the skin. A smooth interface ha
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,11 +25,18 @@ def reflectance(
     Born and Wolf, Principles of Optics, section 1.5.
     """
     cos_t = refracted_cosine(cos_i, n1, n2)
-    # a floor keeps 0/0 out of grazing incidence between equal indices
     tiny = jnp.finfo(jnp.result_type(cos_i)).tiny
-    r_s = (n1 * cos_i - n2 * cos_t) / jnp.maximum(n1 * cos_i + n2 * cos_t, tiny)
-    r_p = (n2 * cos_i - n1 * cos_t) / jnp.maximum(n2 * cos_i + n1 * cos_t, tiny)
-    return jnp.where(cos_t > 0, 0.5 * (r_s**2 + r_p**2), 1.0)
+    return jnp.where(cos_t > 0, unpolarised(cos_i, cos_t, n1, n2, tiny), 1.0)
+
+
+def unpolarised(cos_i: Any, cos_t: Any, n1: Any, n2: Any, tiny: Any = 0.0) -> Any:
+    """Fresnel's equations for unpolarised light at known cosines on both sides, NumPy's or JAX's.
+
+    `tiny` keeps 0/0 out of grazing incidence between equal indices.
+    """
+    r_s = (n1 * cos_i - n2 * cos_t) / (n1 * cos_i + n2 * cos_t + tiny)
+    r_p = (n2 * cos_i - n1 * cos_t) / (n2 * cos_i + n1 * cos_t + tiny)
+    return 0.5 * (r_s**2 + r_p**2)
 
 
 def refracted_cosine(
@@ -110,6 +119,43 @@ def interact(
     return valid, transmitted, out
 
 
+class Outcomes(NamedTuple):
+    """What a facet does to a ray: cosine of incidence on it, and for each way of going on its
+    chance (0 where the ray would end on the wrong side) and the cosine to the surface's normal."""
+
+    cos_i: np.ndarray
+    reflected: np.ndarray
+    up: np.ndarray
+    transmitted: np.ndarray
+    on: np.ndarray
+
+
+def facet_outcomes(
+    cos_s: np.ndarray, cos_phi: np.ndarray, sine: float, n1: float, n2: float
+) -> Outcomes:
+    """The two ends of `interact` for a ray at the given sine to the normal, in float64.
+
+    `cos_s` is the polar cosine of the facets and `cos_phi` the cosine of their azimuth from the
+    plane of incidence; they broadcast. A facet that faces away does nothing.
+    """
+    down = math.sqrt(max(1.0 - sine**2, 0.0))
+    cos_i = cos_s * down - np.sqrt(1.0 - cos_s**2) * cos_phi * sine
+    c = np.clip(cos_i, 0.0, 1.0)
+    ratio = n1 / n2
+    cos2 = (1.0 - ratio) * (1.0 + ratio) + (ratio * c) ** 2
+    cos_t = np.sqrt(np.maximum(cos2, 0.0))
+    share = np.where(cos2 > 0, unpolarised(c, cos_t, n1, n2, 1e-300), 1.0)
+    up = 2.0 * c * cos_s - down
+    on = ratio * down - (ratio * c - cos_t) * cos_s
+    return Outcomes(
+        cos_i,
+        np.where((cos_i > 0) & (up > 0), share, 0.0),
+        up,
+        np.where((cos_i > 0) & (on > 0), 1.0 - share, 0.0),
+        on,
+    )
+
+
 @lru_cache(maxsize=64)
 def surface_reflectance(
     incidence: float, n1: float, n2: float, roughness: float, size: int = 512
@@ -121,22 +167,7 @@ def surface_reflectance(
     """
     table = facet_table(roughness)
     cos_s = np.interp((np.arange(size) + 0.5) / size, np.linspace(0, 1, len(table)), table)
-    phi = np.pi * (np.arange(size) + 0.5) / size
-    sin_s = np.sqrt(1.0 - cos_s**2)
-    c, s = np.meshgrid(cos_s, np.cos(phi), indexing="ij")
-    facet_x = sin_s[:, None] * s
-    ux, uz = np.sin(incidence), np.cos(incidence)
-    cos_i = c * uz - facet_x * ux
-    facing = cos_i > 0
-    ci = np.clip(cos_i, 0.0, 1.0)
-    sin2 = (n1 / n2) ** 2 * (1.0 - ci**2)
-    cos_t = np.sqrt(np.clip(1.0 - sin2, 0.0, None))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        r_s = (n1 * ci - n2 * cos_t) / (n1 * ci + n2 * cos_t)
-        r_p = (n2 * ci - n1 * cos_t) / (n2 * ci + n1 * cos_t)
-    share = np.where(sin2 < 1.0, 0.5 * (r_s**2 + r_p**2), 1.0)
-    up = uz - 2.0 * ci * c < 0  # the reflected ray leaves
-    down = (n1 / n2) * uz - ((n1 / n2) * ci - cos_t) * c > 0
-    reflected = np.mean(np.where(facing & up, share, 0.0))
-    entered = np.mean(np.where(facing & down, 1.0 - share, 0.0))
+    cos_phi = np.cos(np.pi * (np.arange(size) + 0.5) / size)
+    found = facet_outcomes(cos_s[:, None], cos_phi[None, :], math.sin(incidence), n1, n2)
+    reflected, entered = np.mean(found.reflected), np.mean(found.transmitted)
     return float(reflected / (reflected + entered))

@@ -130,10 +130,8 @@ def interface(streams: Streams, n1: float, n2: float) -> np.ndarray:
     if abs(n1 - n2) < SAME:
         return np.zeros(high)
     c1, c2 = streams.cosine(n1)[:low], streams.cosine(n2)[:low]
-    across = (n1 * c1 - n2 * c2) / (n1 * c1 + n2 * c2)
-    along = (n2 * c1 - n1 * c2) / (n2 * c1 + n1 * c2)
     reflectance = np.full(high, TRAPPED)
-    reflectance[:low] = 0.5 * (across**2 + along**2)
+    reflectance[:low] = fresnel.unpolarised(c1, c2, n1, n2)
     return reflectance
 
 
@@ -181,11 +179,10 @@ def surface(
     if roughness <= 0:
         c1 = math.cos(incidence)
         c2 = math.sqrt(1.0 - (p / inside) ** 2)
-        across = (outside * c1 - inside * c2) / (outside * c1 + inside * c2)
-        along = (inside * c1 - outside * c2) / (inside * c1 + outside * c2)
+        at_once = fresnel.unpolarised(c1, c2, outside, inside)
         reflected = interface(streams, outside, inside)[:s]
         enters = streams.interpolation(np.array([p]))[0, :s]
-        return Surface(0.5 * (across**2 + along**2), enters, np.diag(reflected), 1.0 - reflected)
+        return Surface(at_once, enters, np.diag(reflected), 1.0 - reflected)
     at_once, enters = _facets(streams, np.array([p]), outside, inside, roughness, 4 * order)
     squares = streams.upper[:s] - streams.below[:s]
     back, leaves = _facets(streams, np.sqrt(squares), inside, outside, roughness, order)
@@ -209,28 +206,15 @@ def _facets(
     x, w = _unit_nodes(polar)
     place, chance = x**2, 2.0 * x * w
     cos_s = np.interp(place * (len(table) - 1), np.arange(len(table)), table)[:, None]
-    sin_s = np.sqrt(1.0 - cos_s**2)
     cos_phi = np.cos(np.pi * (np.arange(azimuth) + 0.5) / azimuth)[None, :]
     weight = np.broadcast_to(chance[:, None] / azimuth, (polar, azimuth))
     reflected, transmitted = [], []
-    ratio = n1 / n2
     for sine in p / n1:
-        down = math.sqrt(max(1.0 - sine**2, 0.0))
-        cos_i = cos_s * down - sin_s * cos_phi * sine
-        c = np.clip(cos_i, 0.0, 1.0)
-        cos2 = (1.0 - ratio) * (1.0 + ratio) + (ratio * c) ** 2
-        cos_t = np.sqrt(np.maximum(cos2, 0.0))
-        tiny = 1e-300  # grazing light between media of one index
-        across = (n1 * c - n2 * cos_t) / (n1 * c + n2 * cos_t + tiny)
-        along = (n2 * c - n1 * cos_t) / (n2 * c + n1 * cos_t + tiny)
-        share = np.where(cos2 > 0, 0.5 * (across**2 + along**2), 1.0)
-        up = 2.0 * c * cos_s - down
-        on = ratio * down - (ratio * c - cos_t) * cos_s
-        back = weight * np.where((cos_i > 0) & (up > 0), share, 0.0)
-        through = weight * np.where((cos_i > 0) & (on > 0), 1.0 - share, 0.0)
+        found = fresnel.facet_outcomes(cos_s, cos_phi, sine, n1, n2)
+        back, through = weight * found.reflected, weight * found.transmitted
         whole = np.sum(back) + np.sum(through)
-        reflected.append(_deposit(streams, n1, up, back / whole))
-        transmitted.append(_deposit(streams, n2, on, through / whole))
+        reflected.append(_deposit(streams, n1, found.up, back / whole))
+        transmitted.append(_deposit(streams, n2, found.on, through / whole))
     return np.array(reflected), np.array(transmitted)
 
 
