@@ -291,10 +291,11 @@ def _optics(
     roughness: float,
     incidence: float,
     order: int,
+    parts: tuple[int, ...],
 ) -> tuple[dict[str, Any], tuple[int, ...], np.ndarray]:
     """NumPy arrays for `Optics`, streams by layer, and the share reflected at once (u,)."""
-    like = Streams.make((outside, *indices[0]), order)
-    sets = [Streams.make((outside, *row), order, like) for row in indices]
+    parts = Streams.make((outside, *indices[0]), order, parts).parts
+    sets = [Streams.make((outside, *row), order, parts) for row in indices]
     counts = {tuple(st.count(n) for n in row) for st, row in zip(sets, indices, strict=True)}
     if len(counts) > 1 or len({st.weight.size for st in sets}) > 1:
         raise HyliosError(
@@ -341,14 +342,14 @@ def _surfaces(sets, indices, outside, roughness, incidence, order) -> list[strea
     """The surface for each set of indices; interpolated where dispersion makes many of them."""
 
     def one(row):
-        st = Streams.make((outside, *row), order, sets[0])
+        st = Streams.make((outside, *row), order, sets[0].parts)
         return streams.surface(st, outside, row[0], roughness, incidence, order)
 
     if roughness <= 0 or len(indices) <= BETWEEN:
         return [one(row) for row in indices]
     first = np.array(indices[0])
     shift = np.array([row[0] for row in indices]) - first[0]
-    if not np.allclose(np.array(indices) - first, shift[:, None], atol=1e-12):
+    if not np.allclose(np.array(indices) - first, shift[:, None], atol=1e-6):
         return [one(row) for row in indices]
     # dispersion shifts all indices alike, and everything is smooth in the shift
     middle, half = 0.5 * (shift.max() + shift.min()), 0.5 * (shift.max() - shift.min())
@@ -381,14 +382,14 @@ def _concrete(name: str, value: Any) -> np.ndarray:
     return np.asarray(value, np.float64)
 
 
-def _ready(c, kinds, index, outside, roughness, incidence, order, dtype):
+def _ready(c, kinds, index, outside, roughness, incidence, order, dtype, parts=()):
     """(c, optics, which set of them, streams by layer, share reflected at once) for `_solve`.
 
     index: (m + open, w) in float64, concrete.
     """
     columns, which = np.unique(np.round(index, 12), axis=1, return_inverse=True)
     arrays, counts, at_once = _optics(
-        tuple(map(tuple, columns.T.tolist())), kinds, outside, roughness, incidence, order
+        tuple(map(tuple, columns.T.tolist())), kinds, outside, roughness, incidence, order, parts
     )
     which = np.broadcast_to(which.reshape(-1), c.extinction.shape[1:])
     optics = jax.tree.map(lambda a: jnp.asarray(a, dtype), Optics(**arrays))
@@ -396,10 +397,10 @@ def _ready(c, kinds, index, outside, roughness, incidence, order, dtype):
     return c, optics, jnp.asarray(which, jnp.int32), counts, jnp.asarray(at_once[which], dtype)
 
 
-def _run(c, kinds, index, outside, roughness, incidence, order, dtype, inner) -> Solution:
+def _run(c, kinds, index, outside, roughness, incidence, order, dtype, inner, parts=()) -> Solution:
     with _precision(dtype):
         c, optics, which, counts, at = _ready(
-            c, kinds, index, outside, roughness, incidence, order, dtype
+            c, kinds, index, outside, roughness, incidence, order, dtype, parts
         )
         with one_blas_thread():
             out, absorbed, bottom = jax.block_until_ready(
@@ -425,20 +426,23 @@ def skin(
     order: int = ORDER,
     dtype: Any = None,
     inner: bool = False,
+    parts: tuple[int, ...] = (),
 ) -> Solution:
     """Light in the six layers of skin; w wavelengths, or the wavelengths of many specimens.
 
     `incidence` in radians; `dtype` float64 unless given; `inner` also works out what every layer
-    absorbs. Differentiable in all of `layers` but the indices and the roughness, which must be
-    concrete. A specimen's scalars (`thickness`, `bottom`) may carry an axis of wavelengths.
+    absorbs. `parts` fixes the streams between one index and the next, so that specimens with other
+    indices need no compiling (`Streams.make`). Differentiable in all of `layers` but the indices
+    and the roughness, which must be concrete. A specimen's scalars (`thickness`, `bottom`) may
+    carry an axis of wavelengths.
     """
     dtype = jnp.dtype(jnp.float64 if dtype is None else dtype)
     _check(order, incidence)
-    c, kinds, index, roughness = _of_skin(layers, order, dtype)
-    return _run(c, kinds, index, 1.0, roughness, incidence, order, dtype, inner)
+    c, kinds, index, roughness = _of_skin(layers, order, dtype, parts)
+    return _run(c, kinds, index, 1.0, roughness, incidence, order, dtype, inner, parts)
 
 
-def _of_skin(layers: Layers, order: int, dtype: Any):
+def _of_skin(layers: Layers, order: int, dtype: Any, parts: tuple[int, ...] = ()):
     """(coefficients, kind of each layer, indices, roughness)."""
     w = layers.mu_a.shape[1]
     index, roughness = (
@@ -455,7 +459,7 @@ def _of_skin(layers: Layers, order: int, dtype: Any):
         kinds[5] = "scatter"
     theta_0 = _concrete("theta_0", layers.theta_0)
     angles, place = np.unique(theta_0, return_inverse=True)
-    top = Streams.make((1.0, *index[:, 0]), order).weight.size
+    top = Streams.make((1.0, *index[:, 0]), order, parts).weight.size
     with _precision(dtype):
         chi = jnp.asarray(streams.exponential_moments(tuple(angles), 2 * top)[place], dtype)
         isotropic = jnp.zeros_like(chi).at[:, 0].set(1.0)

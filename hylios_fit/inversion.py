@@ -193,7 +193,7 @@ def _job(
     for form in forms if usable.any() else ():
         projected = surrogate.at(form).on(wavelength[usable])
         member = as_float64(projected)
-        offset = instrument.specular_offset(float(projected.surface), specular)
+        offset = instrument.specular_offset(projected.surface_at(vector.held), specular)
         scan = np.asarray(_spectra(member, vector, jnp.asarray(states))) + offset
         models.append(Model(form, member, offset, scan))
         error[form] = projected.error_covariance

@@ -22,10 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hylios_fit import adding, fresnel, instrument, melanosome, skin, table
+from hylios_fit import adding, fresnel, instrument, skin, table
 from hylios_fit.errors import HyliosError
 from hylios_fit.simulation import Curve, check_request
 from hylios_fit.skin import LAYERS, SPECS, Layers, Specimen
+from hylios_fit.statevector import PRIORS
 
 SPECIMENS = 128  # that are solved at every wavelength
 PROBES = 8  # of them, on which each parameter is tried
@@ -48,8 +49,9 @@ class Scene:
         wavelength_nm: narrow bands (B,), nm; with `response`, where that was sampled (N,), rising.
         response: wide bands (B, N): sensitivity times illuminant, in any unit.
         incidence: degrees.
-        ranges: lowest and highest value of each parameter that differs between specimens. Those of
-            the training table if not given. `roughness` and the indices cannot be among them.
+        ranges: lowest and highest value of each parameter that differs between specimens. If not
+            given, those of the training table for pigments, blood, water and lipids. `roughness`
+            and the indices cannot be among them.
         specimen: everything else, `melanosome_form` included.
 
     Raises:
@@ -61,7 +63,7 @@ class Scene:
     incidence: float = 8.0
     ranges: Mapping[str, tuple[float, float]] = dataclasses.field(
         default_factory=lambda: {
-            a.name: (a.lower, a.upper) for a in table.DESIGN if a.name not in STREAMS
+            a.name: (a.lower, a.upper) for a in table.DESIGN if PRIORS[a.name].usual
         }
     )
     specimen: Specimen = dataclasses.field(default_factory=Specimen)
@@ -310,9 +312,6 @@ def side_by_side(
 
 @lru_cache(maxsize=32)
 def _coefficients(form: str, nm: tuple[float, ...]) -> Callable[[Any, Any], Layers]:
-    # before tracing, because it is worked out once and kept
-    melanosome.accepted_share(form, 1.0, jnp.float32(0.1), jnp.float32(0.003))
-
     def one(row, there):
         values = dict(zip(SPECS, row, strict=True))
         medium = skin.let_stand(skin.layers(values, form, np.array(nm)), values, form)
@@ -323,15 +322,8 @@ def _coefficients(form: str, nm: tuple[float, ...]) -> Callable[[Any, Any], Laye
             mu_tissue=medium.mu_tissue * there[:, None],
         )
 
-    def wide(a):  # (n, ..., w) -> (..., n w)
-        return jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1)
-
     def every(rows, there):
-        medium = jax.vmap(one)(rows, there)
-        found = {name: wide(getattr(medium, name)) for name in table.SPECTRAL}
-        found["thickness"] = jnp.repeat(medium.thickness.T, len(nm), axis=1)
-        found["bottom"] = jnp.repeat(medium.bottom, len(nm))
-        return Layers(**found, roughness=medium.roughness[0])
+        return skin.side_by_side(jax.vmap(one)(rows, there))
 
     return jax.jit(every)
 

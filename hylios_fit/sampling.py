@@ -107,7 +107,7 @@ def log_posterior(
     covariance = np.asarray(fit.error_covariance)[np.ix_(used, used)]
     weights, _ = inversion.whitener(covariance, np.ones(int(used.sum()), dtype=bool))
     specular = fit.settings.get("specular", "included")
-    offset = instrument.specular_offset(float(whole.surface), specular)
+    offset = instrument.specular_offset(member.surface_at(vector.held), specular)
     shifted = jnp.asarray(fit.measured[used] - offset)
     arguments = jax.tree.map(_as_array, (member, vector, jnp.asarray(weights), shifted))
     dynamic, static = eqx.partition(arguments, eqx.is_array)

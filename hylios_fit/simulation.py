@@ -250,7 +250,7 @@ def _surrogate(specimen: Specimen, nm: np.ndarray, incidence: float, independent
     reflectance = surrogate.of(specimen, nm)
     member = surrogate.at(specimen.melanosome_form).on(nm)
     error = np.sqrt(np.diag(member.error_covariance(reflectance)))
-    surface = np.full(nm.shape, float(member.surface))
+    surface = np.asarray(member.surface_at(specimen.parameters(member.names)), float)
     return Curve(
         nm, reflectance, error, surface, reflectance - surface, "surrogate", 0,
         np.full(nm.shape, np.nan), "standard_error is the surrogate's held-out error",

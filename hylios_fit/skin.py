@@ -110,7 +110,7 @@ def _unknown(name: str) -> str:
 class Layers(NamedTuple):
     """What the transport sees, top down; w wavelengths (units: cm, 1/cm, rad)."""
 
-    thickness: Float[Array, "6"]
+    thickness: Float[Array, "6"]  # one for each wavelength, if specimens stand side by side
     index: Float[Array, "6 w"]
     mu_a: Float[Array, "6 w"]
     mu_particle: Float[Array, "6 w"]  # geometric attenuation of melanosomes or complexes, Eq. 3
@@ -251,6 +251,45 @@ def melanin_coefficient(
     return eumelanin + pheomelanin
 
 
+def blood_coefficient(
+    values: Mapping[str, Any], wavelength_nm: np.ndarray, dtype: Any = None
+) -> Float[Array, "w"]:
+    """Absorption coefficient of whole blood in 1/cm."""
+    zeta = absorbers.specific_absorption(wavelength_nm)
+    saturation = values["oxygen_saturation"]
+    total = {
+        "oxyhaemoglobin": HAEMOGLOBIN_MG_PER_ML * saturation,
+        "deoxyhaemoglobin": HAEMOGLOBIN_MG_PER_ML * (1 - saturation),
+        "beta_carotene": values["beta_carotene"] * BETA_CAROTENE_IN_BLOOD_MG_PER_ML,
+    }
+    for name in ("carboxyhaemoglobin", "methaemoglobin", "sulfhaemoglobin", "bilirubin"):
+        total[name] = values[name]
+    return sum(
+        (x * jnp.asarray(zeta[n], dtype) for n, x in total.items()), start=jnp.zeros((), dtype)
+    )
+
+
+def base_coefficient(
+    values: Mapping[str, Any], layer: int, wavelength_nm: np.ndarray, dtype: Any = None
+) -> Float[Array, "w"]:
+    """Absorption coefficient of a layer without its melanin and blood in 1/cm."""
+    zeta = absorbers.specific_absorption(wavelength_nm)
+    contents = {
+        "water": WATER, "lipids": LIPIDS, "keratin": KERATIN, "dna": DNA_MG_PER_ML,
+        "urocanic_acid": UROCANIC_ACID_MOL_PER_L, "beta_carotene": BETA_CAROTENE_MG_PER_ML,
+    }  # fmt: skip
+    there = {name: content[layer] for name, content in contents.items() if content[layer]}
+    return sum(
+        (values[n] * x * jnp.asarray(zeta[n], dtype) for n, x in there.items()),
+        start=jnp.zeros((), dtype),
+    )
+
+
+def dispersion(wavelength_nm: np.ndarray) -> np.ndarray:
+    """What `index_dispersion` adds to every index is multiplied by, (w,)."""
+    return (500.0 / np.asarray(wavelength_nm, float)) ** 2 - 1.0
+
+
 def layers(
     values: Mapping[str, Any],
     form: str,
@@ -259,33 +298,17 @@ def layers(
 ) -> Layers:
     """Coefficients of the six layers, differentiable in every value (Eqs. 2, 3 and 7)."""
     nm = np.asarray(wavelength_nm, float)
-    zeta = {k: jnp.asarray(v, dtype) for k, v in absorbers.specific_absorption(nm).items()}
     v = {name: jnp.asarray(value, dtype) for name, value in values.items()}
 
     melanin = melanin_coefficient(v, nm, dtype)
-    blood = (
-        HAEMOGLOBIN_MG_PER_ML * v["oxygen_saturation"] * zeta["oxyhaemoglobin"]
-        + HAEMOGLOBIN_MG_PER_ML * (1 - v["oxygen_saturation"]) * zeta["deoxyhaemoglobin"]
-        + v["carboxyhaemoglobin"] * zeta["carboxyhaemoglobin"]
-        + v["methaemoglobin"] * zeta["methaemoglobin"]
-        + v["sulfhaemoglobin"] * zeta["sulfhaemoglobin"]
-        + v["bilirubin"] * zeta["bilirubin"]
-        + v["beta_carotene"] * BETA_CAROTENE_IN_BLOOD_MG_PER_ML * zeta["beta_carotene"]
-    )
-    dispersion = v["index_dispersion"] * jnp.asarray((500.0 / nm) ** 2 - 1.0, dtype)
+    blood = blood_coefficient(v, nm, dtype)
+    more = v["index_dispersion"] * jnp.asarray(dispersion(nm), dtype)
     parts = ("corneum", *("epidermis",) * 3, "papillary", "reticular")
-    index = jnp.stack([v[f"index_{part}"] + dispersion for part in parts])
+    index = jnp.stack([v[f"index_{part}"] + more for part in parts])
 
     mu_a, mu_particle, albedo = [], [], []
     for i, layer in enumerate(LAYERS):
-        own = (
-            v["water"] * WATER[i] * zeta["water"]
-            + v["lipids"] * LIPIDS[i] * zeta["lipids"]
-            + v["keratin"] * KERATIN[i] * zeta["keratin"]
-            + v["dna"] * DNA_MG_PER_ML[i] * zeta["dna"]
-            + v["urocanic_acid"] * UROCANIC_ACID_MOL_PER_L[i] * zeta["urocanic_acid"]
-            + v["beta_carotene"] * BETA_CAROTENE_MG_PER_ML[i] * zeta["beta_carotene"]
-        )
+        own = base_coefficient(v, i, nm, dtype)
         if layer in STRATA:
             scale = melanosome.SHRINKING[layer]
             per_content = melanosome.attenuation_per_content(form, scale)
@@ -335,6 +358,20 @@ def let_stand(layers: Layers, values: Mapping[str, Any], form: str) -> Layers:
     )
     there = jnp.ones(len(LAYERS), dtype).at[1:4].set(share)
     return layers._replace(mu_particle=layers.mu_particle * there[:, None])
+
+
+def side_by_side(layers: Layers) -> Layers:
+    """Specimens, on a leading axis of every part, as further wavelengths of one; of one roughness.
+
+    `thickness` and `bottom` then have an axis of wavelengths too.
+    """
+    width = layers.mu_a.shape[-1]
+    wide = layers._replace(
+        thickness=jnp.repeat(layers.thickness[..., None], width, axis=-1),
+        bottom=jnp.repeat(layers.bottom[..., None], width, axis=-1),
+    )
+    joined = [jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1) for a in wide[:-1]]
+    return Layers(*joined, roughness=layers.roughness[0])
 
 
 def optics_rows(

@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hylios_fit.errors import HyliosError
+from hylios_fit.skin import SPECS, STRATA
 
 
 @dataclass(frozen=True)
@@ -42,9 +43,12 @@ class Prior:
     factor: str = ""
     loading: float = 0.0
     source: str = ""
+    usual: bool = True  # free unless said otherwise; else the model's own value unless asked for
 
 
 _TABLE_I = "Table I of Chen et al. 2015 (S1 to S4), after Kollias 1991 and Hennessy 2005"
+
+_CELLS = "Whitton and Everall 1973; Sandby-Moller 2003"
 
 #: The declared order is that of the surrogate; the names and priors are these. Together the
 #: first six give a prior of melanin per volume of epidermis from about 0.3 to 15 mg/mL (2 sd).
@@ -71,15 +75,38 @@ PRIORS: Mapping[str, Prior] = {
     "water": Prior(0.95, 0.12, source="Blank 1952; Nakagawa 2010"),
     # No population study found for the dermis: within a factor two of the default.
     "lipids": Prior(1.0, 0.35, source="assumed, within a factor of two"),
+    # What follows stays at the model's value unless it is asked for. Ultraviolet absorbers: the
+    # measured ultraviolet asks for several times the tabulated keratin.
+    "keratin": Prior(1.5, 0.9, 0.3, source="assumed, one to several times the table", usual=False),
+    "dna": Prior(1.5, 0.9, 0.3, source="assumed, as keratin", usual=False),
+    "urocanic_acid": Prior(1.0, 0.4, source="de Fine Olivarius 1997", usual=False),
+    # Up to 1 to 2 % of the haemoglobin in health, more in smokers (Zijlstra 2000).
+    "carboxyhaemoglobin": Prior(2.0, 0.7, 1.0, source="Zijlstra 2000", usual=False),
+    "methaemoglobin": Prior(1.5, 0.6, 1.0, source="Zijlstra 2000", usual=False),
+    "sulfhaemoglobin": Prior(0.15, 0.8, 0.3, source="Zijlstra 2000", usual=False),
+    "bilirubin": Prior(0.006, 0.8, 0.01, source="0.002 to 0.012 mg/mL of serum", usual=False),
+    "beta_carotene": Prior(1.0, 0.6, 0.3, source="Alaluf 2002", usual=False),
+    "thickness_corneum": Prior(0.0012, 0.3, 0.0, source="Egawa 2007", usual=False),
+    "thickness_granulosum": Prior(0.0033, 0.25, 0.0, source=_CELLS, usual=False),
+    "thickness_spinosum": Prior(0.0033, 0.25, 0.0, source=_CELLS, usual=False),
+    "thickness_basale": Prior(0.0033, 0.25, 0.0, source=_CELLS, usual=False),
+    "thickness_papillary": Prior(0.018, 0.3, 0.0, source="Meglinski 2002", usual=False),
+    "thickness_reticular": Prior(0.13, 0.35, 0.0, source="Laurent 2007", usual=False),
+    "index_corneum": Prior(1.53, 0.02, source="Tearney 1995; Ding 2006", usual=False),
+    "index_epidermis": Prior(1.42, 0.03, source="Ding 2006", usual=False),
+    "index_papillary": Prior(1.41, 0.03, source="Ding 2006", usual=False),
+    "index_reticular": Prior(1.42, 0.03, source="Ding 2006", usual=False),
+    "fibre_fraction": Prior(0.24, 0.06, source="0.22 in the paper", usual=False),
+    "reticular_scattering": Prior(12.0, 0.7, 2.0, source="Jacques 2013", usual=False),
+    "reticular_scattering_power": Prior(1.3, 0.35, source="Jacques 2013", usual=False),
+    "bottom_reflectance": Prior(0.6, 0.18, source="0.5 to 0.9 on measured skin", usual=False),
+    "index_dispersion": Prior(0.01, 0.005, source="Ding 2006", usual=False),
 }
 
 #: Conditioning on a held value at the very edge of the box would put its variable at infinity.
 _U_LIMIT = 3.0
 
-#: Weights of granulosum, spinosum and basale (thickness 0.0033 cm each) and of papillary and
-#: reticular dermis (0.02 and 0.1 cm) in what is meant per volume; water of the dermis in %.
-EPIDERMIS_CM = (0.0033, 0.0033, 0.0033)
-DERMIS_CM = (0.02, 0.1)
+#: Water of the dermis in % at the model's content.
 DERMIS_WATER_PERCENT = 75.0
 
 
@@ -107,7 +134,7 @@ class StateVector(eqx.Module):
     factor: np.ndarray
     """(N, N) lower triangular; prior covariance of u is factor @ factor.T."""
     held: np.ndarray
-    """(P,) values of the held parameters, the prior's median where free."""
+    """(P,) values of the held parameters, the prior's median where free by default."""
 
     @property
     def index(self) -> np.ndarray:
@@ -207,8 +234,9 @@ def state_vector(
 ) -> StateVector:
     """The state vector for a surrogate's parameters and box.
 
-    `names` (P), `lower` and `upper` (P,): the surrogate's. `free`: which vary (all that are not
-    fixed, if None); the others stay at the median of their prior. `fix`: values that are known;
+    `names` (P), `lower` and `upper` (P,): the surrogate's. `free`: which vary (if None all that
+    are not fixed, of those that their prior calls usual); the others stay at the median of their
+    prior, those that are not usual at the model's own value. `fix`: values that are known;
     the prior of the free ones is conditioned on them.
 
     Raises `HyliosError` for an unknown name, a value outside the box, a name both free and fixed,
@@ -235,7 +263,8 @@ def state_vector(
             raise HyliosError(
                 f"{name} = {value} is outside the surrogate's range {low:g} to {high:g}"
             )
-    chosen = tuple(n for n in names if n not in fix and (free is None or n in free))
+    free = [n for n in names if PRIORS[n].usual] if free is None else free
+    chosen = tuple(n for n in names if n not in fix and n in free)
     if not chosen:
         raise HyliosError(f"nothing is free: leave at least one of {known}")
 
@@ -262,6 +291,9 @@ def state_vector(
         mean=np.zeros(len(chosen)), factor=np.eye(len(chosen)), held=median,
     )  # fmt: skip
     held = median.copy()
+    for i, (name, prior) in enumerate(zip(names, priors, strict=True)):
+        if not prior.usual:
+            held[i] = np.clip(SPECS[name].default, lower[i], upper[i])
     for name, value in fix.items():
         held[names.index(name)] = float(value)
     correlation = prior_correlation(names)
@@ -293,19 +325,20 @@ def derived(
         % volume of the dermis.
     """
     p = {name: parameters[..., i] for i, name in enumerate(names)}
+
+    def mean(layers: tuple[str, ...], contents: Any) -> Any:
+        """By volume."""
+        widths = [p.get(f"thickness_{n}", SPECS[f"thickness_{n}"].default) for n in layers]
+        return sum(w * x for w, x in zip(widths, contents, strict=True)) / sum(widths)
+
     quantities = {}
-    strata = ("melanosome_granulosum", "melanosome_spinosum", "melanosome_basale")
+    strata = tuple(f"melanosome_{stratum}" for stratum in STRATA)
     if {*strata, "colloidal_melanin", "eumelanin", "pheomelanin"} <= p.keys():
-        content = sum(
-            thickness * (p[stratum] + p["colloidal_melanin"])
-            for thickness, stratum in zip(EPIDERMIS_CM, strata, strict=True)
-        ) / sum(EPIDERMIS_CM)
+        content = mean(STRATA, [p[stratum] + p["colloidal_melanin"] for stratum in strata])
         quantities["melanin_mg_per_mL"] = content / 100.0 * (p["eumelanin"] + p["pheomelanin"])
     if {"blood_papillary", "blood_reticular"} <= p.keys():
-        papillary, reticular = DERMIS_CM
-        quantities["blood_percent"] = (
-            papillary * p["blood_papillary"] + reticular * p["blood_reticular"]
-        ) / (papillary + reticular)
+        parts = ("papillary", "reticular")
+        quantities["blood_percent"] = mean(parts, [p[f"blood_{part}"] for part in parts])
     if "oxygen_saturation" in p:
         quantities["oxygen_saturation"] = p["oxygen_saturation"]
     if "water" in p:

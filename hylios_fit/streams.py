@@ -30,15 +30,15 @@ FACETS = (32, 12)
 
 
 def _panels(
-    breaks: tuple[float, ...], order: int, like: Streams | None
+    breaks: tuple[float, ...], order: int, parts: tuple[int, ...]
 ) -> list[tuple[float, float, int, int]]:
-    """(a, b, nodes, power of q) of every part of the range; nodes as in `like`, if given."""
+    """(a, b, nodes, power of q) of every part of the range; nodes as in `parts`, if as many."""
     panels = []
     for k, (a, b) in enumerate(zip((0.0, *breaks[:-1]), breaks, strict=True)):
         share = (b * b - a * a) / (b * b)
         nodes = order if a == 0.0 else max(3, math.ceil(1.7 * order * share**0.35))
-        if like is not None and len(like.panels) == len(breaks):
-            nodes = like.panels[k][2]
+        if len(parts) == len(breaks):
+            nodes = parts[k]
         panels.append((a, b, nodes, 1 if a == 0.0 else 2))
     return panels
 
@@ -69,13 +69,14 @@ class Streams:
         return isinstance(other, Streams) and self.panels == other.panels
 
     @classmethod
-    def make(cls, indices: tuple[float, ...], order: int, like: Streams | None = None) -> Streams:
-        """Streams for media of these indices, in number as those of `like`, if given."""
+    def make(cls, indices: tuple[float, ...], order: int, parts: tuple[int, ...] = ()) -> Streams:
+        """Streams for media of these indices; `parts`, if given, says how many in each part of
+        the range between two of them, where `order` alone would decide it by its width."""
         breaks: list[float] = []
         for n in sorted(indices):
             if not breaks or n > breaks[-1] + SAME:
                 breaks.append(n)
-        panels = _panels(tuple(breaks), order, like)
+        panels = _panels(tuple(breaks), order, parts)
         weight, upper, below = [], [], []
         for a, b, n, power in panels:
             x, w = _unit_nodes(n)
@@ -85,6 +86,11 @@ class Streams:
             upper.append(np.full(n, b * b))
             below.append(span * x ** (2 * power))
         return cls(tuple(panels), *(np.concatenate(v) for v in (weight, upper, below)))
+
+    @property
+    def parts(self) -> tuple[int, ...]:
+        """How many streams each part of the range has."""
+        return tuple(nodes for _, _, nodes, _ in self.panels)
 
     def count(self, index: float) -> int:
         """How many streams, the first ones, exist in a medium."""

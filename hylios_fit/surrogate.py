@@ -1,9 +1,9 @@
 """The surrogate: parameters -> reflectance spectrum, in JAX, within the range it was trained on.
 
-One `Member` for each melanosome form: standardised features, a perceptron (or an ensemble) that
-gives the scores of the principal components (trained by scikit-learn in `training`), and the way
-back to reflectance. It knows its training box and the covariance of its own error, measured on
-specimens that it never saw. Its file is a plain .npz without pickle.
+One `Member` for each melanosome form: standardised features, a perceptron that gives the scores of
+the principal components (trained by scikit-learn in `training`), the way back to reflectance, and
+what the surface adds by Fresnel's equations. It knows its training box and the covariance of its
+own error, measured on specimens that it never saw. Its file is a plain .npz without pickle.
 """
 
 from __future__ import annotations
@@ -26,55 +26,63 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from hylios_fit import datasets, melanosome
+from hylios_fit import datasets, melanosome, skin
 from hylios_fit.errors import HyliosError
-from hylios_fit.skin import Specimen
+from hylios_fit.skin import LAYERS, STRATA, Specimen
 
 FORMAT = "hylios_fit surrogate"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 FLOOR = 0.3
 """Added to the subsurface reflectance before the logarithm: errors are less than relative."""
 
-# Features: log(x + offset) of what may be 0, log of what may not, the rest as it is
+# Features: log(x + offset) of what spans orders of magnitude, the rest as it is
 OFFSETS = {
-    "melanosome_granulosum": 0.3,
-    "melanosome_spinosum": 0.3,
-    "melanosome_basale": 0.3,
+    **dict.fromkeys((f"melanosome_{stratum}" for stratum in STRATA), 0.3),
     "colloidal_melanin": 0.1,
-    "eumelanin": 0.0,
-    "pheomelanin": 0.0,
-    "blood_papillary": 0.0,
-    "blood_reticular": 0.0,
+    **dict.fromkeys(("eumelanin", "pheomelanin", "blood_papillary", "blood_reticular"), 0.0),
+    **dict.fromkeys(("keratin", "dna", "carboxyhaemoglobin", "methaemoglobin"), 1.0),
+    **dict.fromkeys(("sulfhaemoglobin", "beta_carotene"), 0.3),
+    "bilirubin": 0.01,
+    "reticular_scattering": 2.0,
+    **dict.fromkeys((f"thickness_{layer}" for layer in LAYERS), 0.0),
 }
-_TOGETHER = (*OFFSETS, "oxygen_saturation")
+FEATURES_NM = np.array(
+    [255, 285, 320, 380, 415, 435, 460, 500, 545, 576, 600, 630, 760, 900, 1200, 1450, 1930, 2300.0]
+)
+"""Wavelengths at which the features hold how deep the layers are, optically."""
+DETOUR = 1.64  # bounces inside melanosomes make light absorbed weakly that much longer
+FAINT = 3e-3  # optical depth that is as good as none
 SLACK = 1e-5  # of the box's width, for rounding
 BLOCK = 4096  # rows of a batch of more than four blocks: what they need stays in the cache
 PRECISION = "highest"  # some accelerators multiply float32 with 10 bits unless told not to
 
 
-def features(names: tuple[str, ...], parameters: Float[Array, "... p"]) -> Float[Array, "... f"]:
-    """What the regression sees, before standardising: each parameter, and what acts together."""
+def features(
+    names: tuple[str, ...], form: str, parameters: Float[Array, "... p"]
+) -> Float[Array, "... f"]:
+    """What the regression sees, before standardising: each parameter, and the logarithms of the
+    optical depth (absorption) of epidermis, papillary and reticular dermis at `FEATURES_NM`."""
     at = {name: parameters[..., i] for i, name in enumerate(names)}
-    columns = [jnp.log(x + OFFSETS[name]) if name in OFFSETS else x for name, x in at.items()]
-    if set(_TOGETHER) <= at.keys():
-        strata = [at[f"melanosome_{stratum}"] for stratum in ("granulosum", "spinosum", "basale")]
-        colloidal, melanin = at["colloidal_melanin"], at["eumelanin"] + at["pheomelanin"]
-        content = sum(strata)
-        columns += [jnp.sqrt(x + 0.01) for x in (*strata, colloidal)]
-        columns += [
-            jnp.log(content + 0.3),
-            jnp.log(melanin),
-            jnp.log((content / 3.0 + colloidal + 0.1) * melanin),
-        ]
-        oxygen = at["oxygen_saturation"]
-        upper, lower = at["blood_papillary"], at["blood_reticular"]
-        columns += [jnp.log(upper + lower), jnp.log(0.2 * upper + lower)]
-        columns += [
-            jnp.log(blood * share + 0.02)
-            for blood in (upper, lower)
-            for share in (oxygen, 1.0 - oxygen)
-        ]
-    return jnp.stack(columns, axis=-1)
+    own = [jnp.log(x + OFFSETS[name]) if name in OFFSETS else x for name, x in at.items()]
+    v = {**Specimen().values, **at}
+    v = {name: jnp.asarray(value, parameters.dtype)[..., None] for name, value in v.items()}
+    melanin = skin.melanin_coefficient(v, FEATURES_NM, parameters.dtype)
+    blood = skin.blood_coefficient(v, FEATURES_NM, parameters.dtype)
+    rest = [skin.base_coefficient(v, i, FEATURES_NM, parameters.dtype) for i in range(len(LAYERS))]
+    epidermis = rest[0] * v["thickness_corneum"]
+    for i, stratum in enumerate(STRATA, 1):
+        mu = rest[i] + v["colloidal_melanin"] / 100 * melanin
+        scale = melanosome.SHRINKING[stratum]
+        attenuation = melanosome.attenuation_per_content(form, scale)
+        lost = -jnp.expm1(-DETOUR / attenuation * melanin)  # at a hit, about
+        mu = mu + v[f"melanosome_{stratum}"] / 100 * attenuation * lost
+        epidermis = epidermis + mu * v[f"thickness_{stratum}"]
+    depths = [epidermis]
+    for i, part in enumerate(("papillary", "reticular"), 4):
+        mu = rest[i] + v[f"blood_{part}"] / 100 * blood
+        depths.append(mu * v[f"thickness_{part}"])
+    logs = [jnp.log(depth + FAINT) for depth in depths]
+    return jnp.concatenate([jnp.stack(own, axis=-1), *logs], axis=-1)
 
 
 class Member(eqx.Module):
@@ -91,11 +99,12 @@ class Member(eqx.Module):
     upper: Float[Array, "p"]
     centre: Float[Array, "f"]
     scale: Float[Array, "f"]
-    weights: tuple[Float[Array, "e i o"], ...]
-    biases: tuple[Float[Array, "e o"], ...]
+    weights: tuple[Float[Array, "i o"], ...]
+    biases: tuple[Float[Array, "o"], ...]
     components: Float[Array, "k c"]
     mean: Float[Array, "c"]
-    surface: Float[Array, ""]
+    fresnel: Float[Array, "q"]  # what the surface reflects, a polynomial of the index above 1.5
+    dispersion: Float[Array, "b"]  # what `index_dispersion` is multiplied by
     wavelength_nm: np.ndarray  # of the bands
     readout: Float[Array, "c b"] | None  # bands from the wavelengths; None: they are the bands
     modes: Float[Array, "m b"]  # of the logarithm's error: modes.T @ modes + diag(rest)
@@ -117,20 +126,40 @@ class Member(eqx.Module):
             keepdims=True,
         )
         bounded = jnp.clip(p, self.lower.reshape(like), self.upper.reshape(like))
-        x = (features(self.names, bounded) - self.centre.reshape(like)) / self.scale.reshape(like)
-        x = jnp.broadcast_to(x, (self.weights[0].shape[0], *x.shape))
+        x = features(self.names, self.form, bounded)
+        x = (x - self.centre.reshape(like)) / self.scale.reshape(like)
         for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = jnp.einsum("e...i,eio->e...o", x, w, precision=PRECISION)
-            x = x + b.reshape(b.shape[0], *(1,) * (p.ndim - 1), b.shape[1])
+            x = jnp.matmul(x, w, precision=PRECISION) + b.reshape(like)
             if i < len(self.weights) - 1:
                 x = jnp.tanh(x)
-        scores = jnp.mean(x, axis=0)
-        log = jnp.matmul(scores, self.components, precision=PRECISION) + self.mean.reshape(like)
+        log = jnp.matmul(x, self.components, precision=PRECISION) + self.mean.reshape(like)
         bands = jnp.exp(log) - FLOOR
         if self.readout is not None:
             bands = jnp.matmul(bands, self.readout, precision=PRECISION)
-        bands = self.surface + (1.0 - self.surface) * bands
+        surface = self.surface_at(bounded)
+        bands = surface + (1.0 - surface) * bands
         return jnp.where(inside, bands, jnp.nan)
+
+    def surface_at(self, parameters: Any) -> Float[Array, "... b"]:
+        """What the surface reflects at once: what an instrument with a gloss trap does not see."""
+        p = jnp.asarray(parameters, self.centre.dtype)
+        like = (1,) * (p.ndim - 1) + (-1,)
+        usual = Specimen().values
+        corneum, dispersion = (
+            p[..., self.names.index(name), None] if name in self.names else usual[name]
+            for name in ("index_corneum", "index_dispersion")
+        )
+        above = corneum - 1.5 + dispersion * self.dispersion.reshape(like)
+        found = self.fresnel[-1]
+        for coefficient in self.fresnel[-2::-1]:
+            found = found * above + coefficient
+        return found
+
+    @property
+    def surface(self) -> Float[np.ndarray, "b"]:
+        """`surface_at` the usual index of the corneum."""
+        usual = Specimen().parameters(self.names)
+        return np.asarray(self.surface_at(usual), float) * np.ones(len(self.wavelength_nm))
 
     # arrays have no hash, and jax.jit wants one of what it compiles
     __hash__ = object.__hash__
@@ -149,7 +178,7 @@ class Member(eqx.Module):
 
     def error_scale(self, reflectance: np.ndarray) -> np.ndarray:
         """Change of the reflectance for one of the logarithm that the regression gives."""
-        surface = float(self.surface)
+        surface = self.surface
         inside = np.clip(np.asarray(reflectance, float) - surface, 0.0, None)
         return inside + (1.0 - surface) * FLOOR
 
@@ -213,6 +242,7 @@ class Member(eqx.Module):
             projected=True,
             components=self.components[:, used],
             mean=self.mean[used],
+            dispersion=jnp.asarray(w @ np.asarray(self.dispersion, float), dtype),
             wavelength_nm=w @ grid if wavelength_nm is None else np.asarray(wavelength_nm, float),
             readout=None
             if np.array_equal(readout, np.eye(len(used)))
@@ -491,7 +521,8 @@ def _member(form: str, arrays: dict[str, np.ndarray], about: dict[str, Any]) -> 
         biases=tuple(get(f"bias{i}") for i in range(depth)),
         components=get("components"),
         mean=get("mean"),
-        surface=jnp.asarray(about["surface"], jnp.float32),
+        fresnel=jnp.asarray(arrays["fresnel"], jnp.float32),
+        dispersion=jnp.asarray(skin.dispersion(arrays["wavelength_nm"]), jnp.float32),
         wavelength_nm=arrays["wavelength_nm"].astype(float),
         readout=None,
         modes=get("modes"),
@@ -504,8 +535,8 @@ def check_report(surrogate: Surrogate) -> str:
     about = surrogate.about
     member = surrogate.at(surrogate.forms[0])
     lines = [
-        f"surrogate of {about['rows']} rows ({about['generator']}, {about['rays']} rays for every "
-        f"{about['rows_sharing_paths']}), hylios_fit {about['hylios_fit']}, seed {about['seed']}",
+        f"surrogate of {about['rows']} rows ({about['generator']}), "
+        f"hylios_fit {about['hylios_fit']}, seed {about['seed']}",
         f"held out: {about['held_out']}",
         "",
         "trained on:",
@@ -534,4 +565,7 @@ def check_report(surrogate: Surrogate) -> str:
     lines.append("whole range           " + "".join(f"{v:12.4f}" for v in whole))
     most = about["held_out_most"]
     lines.append("99.9 % of all within  " + "".join(f"{most[f]:12.4f}" for f in surrogate.forms))
+    for form in surrogate.forms:
+        lines += ["", f"by region of the box, {form}, worst first (RMS, largest):"]
+        lines += [f"  {text:46s}{rms:8.4f}{top:9.4f}" for text, rms, top in about["regions"][form]]
     return "\n".join(lines)

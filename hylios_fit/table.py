@@ -14,10 +14,11 @@ a table grows by further rows of the same sequence.
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, nullcontext, suppress
 from functools import lru_cache
@@ -36,13 +37,14 @@ if TYPE_CHECKING:
     import xarray
 
 FORMAT = "hylios_fit table"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 ROWS = 16_384
 RAYS = 8192  # of each set of paths
 SHARE = 8  # rows that one set of paths serves
 GROUPS = 8  # sets of paths of one melanosome form that walk together
 GENERATORS = ("walker", "adding")
-ADDING_ORDER = 6  # of what `adding` stores; its error, below 3e-4, is far below the surrogate's
+ADDING_ORDER = 6  # of what `adding` stores
+ADDING_PARTS = (6, 8, 5, 5, 5)  # its streams in every row, so that no indices need compiling anew
 ADDING_CHECK = 12  # the order that the first row of each chunk and form is held against
 WAIT = 0.2  # seconds between looks at what another process is at
 ABSORB = 0.5  # share of the absorption that ends rays on the way (the rest is in the weights)
@@ -64,7 +66,10 @@ class Axis(NamedTuple):
 
 MELANOSOMES = "1 to 10 % of the epidermis on average (Lister 2013), more in single strata"
 MELANIN = "17.9 to 72.3 % of a melanosome (Kollias et al. 1991), at the ratios of Hennessy (2005)"
-BLOOD = "0.2 to 4 %, more in lesions (Jacques 1996)"
+BLOOD = "0.2 to 4 % (Jacques 1996); port-wine stains have several times that (Barsky et al. 1980)"
+CELLS = "35 to 120 um of living epidermis (Whitton and Everall 1973; Sandby-Moller et al. 2003)"
+INDEX = "1.36 to 1.43 in vivo (Ding et al. 2006), up to what the measured near infrared asks for"
+ULTRAVIOLET = "none, to what makes up for the absorbers that the ultraviolet of NIST's set asks for"
 DESIGN = (
     Axis("melanosome_granulosum", 0.0, 12.0, "square", MELANOSOMES, paths=True),
     Axis("melanosome_spinosum", 0.0, 12.0, "square", MELANOSOMES, paths=True),
@@ -72,74 +77,96 @@ DESIGN = (
     Axis("colloidal_melanin", 0.0, 20.0, "cube", "0.8 to 15 % in Table I of the paper"),
     Axis("eumelanin", 5.0, 150.0, "log", MELANIN),
     Axis("pheomelanin", 0.2, 20.0, "log", MELANIN),
-    Axis("blood_papillary", 0.02, 12.0, "log", BLOOD),
+    Axis("blood_papillary", 0.02, 20.0, "log", BLOOD),
     Axis("blood_reticular", 0.02, 12.0, "log", BLOOD),
     Axis("oxygen_saturation", 0.0, 1.0, "linear", "all that is possible"),
     Axis("water", 0.4, 1.3, "linear", "dry to oedematous, as in Blank (1952)"),
-    Axis("lipids", 0.0, 2.0, "linear", "none to twice the usual"),
+    Axis("lipids", 0.0, 3.0, "linear", "none to three times the usual"),
+    Axis("keratin", 0.0, 40.0, "cube", ULTRAVIOLET),
+    Axis("dna", 0.0, 40.0, "cube", ULTRAVIOLET),
+    Axis("urocanic_acid", 0.0, 5.0, "square", "4 to 34 nmol/cm2 (de Fine Olivarius 1997)"),
+    Axis("carboxyhaemoglobin", 0.0, 30.0, "square", "to 20 %, smoke poisoning (Blumenthal 2001)"),
+    Axis("methaemoglobin", 0.0, 60.0, "square", "to 40 %, methaemoglobinaemia (Wright 1999)"),
+    Axis("sulfhaemoglobin", 0.0, 12.0, "square", "to 8 %, as sulfhaemoglobinaemia has"),
+    Axis("bilirubin", 0.0, 0.4, "square", "to severe jaundice of the newborn (Maisels 2008)"),
+    Axis("beta_carotene", 0.0, 10.0, "square", "none, to carotenodermia (Alaluf et al. 2002)"),
+    Axis("thickness_corneum", 5e-4, 5e-3, "log", "6 to 40 um, but for palms (Egawa 2007)", True),
+    Axis("thickness_granulosum", 1.5e-3, 0.01, "log", CELLS, paths=True),
+    Axis("thickness_spinosum", 1.5e-3, 0.01, "log", CELLS, paths=True),
+    Axis("thickness_basale", 1.5e-3, 0.01, "log", CELLS, paths=True),
+    Axis("thickness_papillary", 0.005, 0.05, "log", "0.1 to 0.3 mm (Meglinski 2002)", paths=True),
+    Axis("thickness_reticular", 0.05, 0.5, "log", "0.5 to 4 mm (Laurent et al. 2007)", paths=True),
+    Axis("index_corneum", 1.42, 1.62, "linear", "1.47 to 1.57 (Tearney 1995; Ding 2006)", True),
+    Axis("index_epidermis", 1.35, 1.57, "linear", INDEX, paths=True),
+    Axis("index_papillary", 1.35, 1.57, "linear", INDEX, paths=True),
+    Axis("index_reticular", 1.35, 1.57, "linear", INDEX, paths=True),
+    Axis("fibre_fraction", 0.05, 0.6, "linear", "0.22 in the paper; fibres of 66 to 140 nm", True),
+    Axis("reticular_scattering", 0.0, 80.0, "square", "46/cm (Jacques 2013), to twice that", True),
+    Axis("reticular_scattering_power", 0.0, 3.0, "linear", "1 to 3 (Jacques 2013)", paths=True),
+    Axis("bottom_reflectance", 0.0, 1.0, "linear", "all that is possible"),
 )
 NAMES = tuple(axis.name for axis in DESIGN)
 PATHS = np.array([axis.paths for axis in DESIGN])
+INDICES = np.array([axis.name.startswith("index_") for axis in DESIGN])
+SHIFT = (-0.04, 0.12)
+"""The refractive indices of a row are moved together by as much as `index_dispersion` moves them
+within the spectrum: so the table knows what that does without a spectrum of indices in each row."""
 
 
-def design(rows: int, seed: int = 0, share: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+def spread(u: np.ndarray, lower: float, upper: float, how: str) -> np.ndarray:
+    """The unit interval over a range, as `Axis.spread` says."""
+    if how == "log":
+        return lower * (upper / lower) ** u
+    return lower + (upper - lower) * u ** {"linear": 1, "square": 2, "cube": 3}[how]
+
+
+def design(rows: int, seed: int = 0, generator: str = "walker") -> tuple[np.ndarray, np.ndarray]:
     """Parameters (rows, P) and melanosome form (rows,; index into FORMS) of the design.
 
-    Scrambled Sobol sequences, one group of `share` rows for each form in turn, so that the first
-    rows of a larger table are those of a smaller one. Rows of a group agree in what changes paths.
+    Scrambled Sobol sequences, one group of `SHARE` rows for each form in turn, so that the first
+    rows of a larger table are those of a smaller one. Rows of a group agree in what changes paths
+    (`walker`), or in the indices, which the streams depend on (`adding`).
     """
     from scipy.stats import qmc
 
-    share = share or SHARE
-    groups = -(-rows // (share * len(FORMS)))
+    groups = -(-rows // (SHARE * len(FORMS)))
+    together = PATHS if generator == "walker" else INDICES
 
     def sobol(dimensions: int, count: int, stream: int) -> np.ndarray:
-        generator = np.random.default_rng([seed, stream])
-        points = qmc.Sobol(dimensions, rng=generator)
+        points = qmc.Sobol(dimensions, rng=np.random.default_rng([seed, stream]))
         return points.random(1 << int(np.ceil(np.log2(max(count, 2)))))[:count]
 
-    if share == 1:
-        unit = sobol(len(DESIGN), groups, 2)
-    else:
-        unit = np.empty((groups * share, len(DESIGN)))
-        unit[:, PATHS] = np.repeat(sobol(int(PATHS.sum()), groups, 0), share, axis=0)
-        unit[:, ~PATHS] = sobol(int((~PATHS).sum()), groups * share, 1)
-    columns = []
-    for u, axis in zip(unit.T, DESIGN, strict=True):
-        if axis.spread == "log":
-            columns.append(axis.lower * (axis.upper / axis.lower) ** u)
-        else:
-            power = {"linear": 1, "square": 2, "cube": 3}[axis.spread]
-            columns.append(axis.lower + (axis.upper - axis.lower) * u**power)
-    grouped = np.stack(columns, axis=1).reshape(groups, 1, share, -1)
-    both = np.repeat(grouped, len(FORMS), axis=1).reshape(groups * len(FORMS) * share, -1)
-    form = np.arange(len(both)) // share % len(FORMS)
+    common = np.repeat(sobol(int(together.sum()) + 1, groups, 0), SHARE, axis=0)
+    unit = np.empty((groups * SHARE, len(DESIGN)))
+    unit[:, together] = common[:, 1:]
+    unit[:, ~together] = sobol(int((~together).sum()), groups * SHARE, 1)
+    columns = (
+        spread(u, axis.lower, axis.upper, axis.spread)
+        for u, axis in zip(unit.T, DESIGN, strict=True)
+    )
+    values = np.stack(list(columns), axis=1)
+    values[:, INDICES] += SHIFT[0] + (SHIFT[1] - SHIFT[0]) * common[:, :1]
+    grouped = values.reshape(groups, 1, SHARE, -1)
+    both = np.repeat(grouped, len(FORMS), axis=1).reshape(groups * len(FORMS) * SHARE, -1)
+    form = np.arange(len(both)) // SHARE % len(FORMS)
     return both[:rows], form[:rows]
 
 
-@lru_cache(maxsize=4)
-def _coefficients(form: str):
-    """Layers of many rows at once: parameters (r, P) -> Layers with a leading axis."""
+@lru_cache(maxsize=8)
+def layers_of(
+    names: tuple[str, ...], form: str, stand: bool = True
+) -> Callable[[np.ndarray], Layers]:
+    """Parameters (n, P) -> layers with a leading axis, everything unnamed as usual; with `stand`
+    as many particles as the walks let stand."""
     defaults = Specimen().values
 
     def one(row: jax.Array) -> Layers:
-        values = {**defaults, **dict(zip(NAMES, row, strict=True))}
-        return skin.layers(values, form, WAVELENGTHS)
+        values = {**defaults, **dict(zip(names, row, strict=True))}
+        medium = skin.layers(values, form, WAVELENGTHS)
+        return skin.let_stand(medium, values, form) if stand else medium
 
-    return jax.jit(jax.vmap(one))
-
-
-SPECTRAL = ("index", "mu_a", "mu_particle", "hit_albedo", "theta_0", "mu_fibre", "mu_tissue")
-
-
-def _side_by_side(medium: Layers) -> Layers:
-    """Rows as further wavelengths of one set of layers: they share thicknesses and surface."""
-    first = jax.tree.map(lambda a: a[0], medium)
-
-    def wide(a: jax.Array) -> jax.Array:  # (r, ..., w) -> (..., r w)
-        return jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1)
-
-    return first._replace(**{name: wide(getattr(medium, name)) for name in SPECTRAL})
+    every = jax.jit(jax.vmap(one))
+    return lambda rows: every(jnp.asarray(rows, jnp.float32))
 
 
 def walk_rows(
@@ -147,26 +174,26 @@ def walk_rows(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reflectance and its standard error, (rows, wavelengths) each, at 8 degrees of incidence.
 
-    `parameters` (rows, P) in the order of `NAMES`; every `SHARE` rows in turn have the same
-    melanosome contents and share `rays` rays.
+    `parameters` (rows, P) in the order of `NAMES`; every `SHARE` rows in turn agree in what
+    changes paths, and share `rays` rays.
     """
     w = len(WAVELENGTHS)
     groups = parameters.reshape(-1, SHARE, parameters.shape[-1])
     if not (groups[..., PATHS] == groups[:, :1, PATHS]).all():
-        raise HyliosError(f"each {SHARE} rows must have the same melanosome contents")
-    count = len(groups)
+        raise HyliosError(f"each {SHARE} rows must agree in what changes paths")
     least = groups.min(axis=1)
-    saturation = NAMES.index("oxygen_saturation")
-    least[:, saturation] = groups[..., saturation].mean(axis=1)
-    coefficients = _coefficients(form)
-    walked = coefficients(jnp.asarray(least, jnp.float32))
-    asked = coefficients(jnp.asarray(parameters, jnp.float32))
+    for name in ("oxygen_saturation", "bottom_reflectance"):  # absorbs neither more nor less
+        place = NAMES.index(name)
+        least[:, place] = groups[..., place].mean(axis=1)
+    coefficients = layers_of(NAMES, form, stand=False)
+    walked, asked = coefficients(least), coefficients(parameters)
     # groups in turn, so that long and short rays share the lanes
+    count = len(groups)
     bits = jax.random.bits(key, (count,), jnp.uint32)
     shares = walker.hero_shares(walked.theta_0[0])
     own = np.stack([walker.spread(shares, b[None], 0, rays) for b in bits], axis=1)
     paths = walker.walk(
-        _side_by_side(walked),
+        skin.side_by_side(walked),
         form,
         key,
         incidence=np.radians(INCIDENCE_DEG),
@@ -174,7 +201,7 @@ def walk_rows(
         absorb=ABSORB,
         heroes=(own + w * np.arange(count)).reshape(-1),
     )
-    surface = surface_share(Specimen())
+    surface = surface_share(parameters)
     reflectance, error = np.empty((2, len(parameters), w))
     for g in range(count):
         mine = walker.Paths(
@@ -186,54 +213,63 @@ def walk_rows(
         base = Layers(*(part[g] for part in walked))
         for row in range(g * SHARE, (g + 1) * SHARE):
             found = tally.collect(mine, base, Layers(*(part[row] for part in asked)), ABSORB)
-            reflectance[row] = surface + (1.0 - surface) * np.asarray(found.mean)
-            error[row] = (1.0 - surface) * np.asarray(found.standard_error)
+            reflectance[row] = surface[row] + (1.0 - surface[row]) * np.asarray(found.mean)
+            error[row] = (1.0 - surface[row]) * np.asarray(found.standard_error)
     return reflectance, error
 
 
 def add_rows(parameters: np.ndarray, form: str) -> tuple[np.ndarray, np.ndarray]:
-    """As `walk_rows`, by the deterministic solver; the error is that of the first row."""
-    from hylios_fit import adding
+    """As `walk_rows`, by the deterministic solver.
 
-    defaults = Specimen().values
-
-    def solve(row: np.ndarray, order: int) -> np.ndarray:
-        values = {**defaults, **dict(zip(NAMES, row.tolist(), strict=True))}
-        medium = skin.let_stand(_coefficients_of(row, form), values, form)
-        angle = float(np.radians(INCIDENCE_DEG))
-        return np.asarray(adding.skin(medium, incidence=angle, order=order).reflectance)
-
-    reflectance = np.stack([solve(row, ADDING_ORDER) for row in parameters])
-    error = np.abs(reflectance[0] - solve(parameters[0], ADDING_CHECK))
+    The error of all rows is that of the first: what a higher order changes.
+    """
+    reflectance = solve_rows(NAMES, parameters, form)
+    error = np.abs(reflectance[:1] - solve_rows(NAMES, parameters[:1], form, ADDING_CHECK))
     return reflectance, np.broadcast_to(error, reflectance.shape)
 
 
-def _coefficients_of(row: np.ndarray, form: str) -> Layers:
-    medium = _coefficients(form)(jnp.asarray(row[None], jnp.float32))
-    return jax.tree.map(lambda a: a[0], medium)
+def solve_rows(
+    names: tuple[str, ...], parameters: np.ndarray, form: str, order: int = ADDING_ORDER
+) -> np.ndarray:
+    """Reflectance (n, w) of specimens (n, P) by adding-doubling, at the table's wavelengths.
+
+    Specimens of the same refractive indices are solved together, and none needs compiling anew.
+    """
+    from hylios_fit import adding
+
+    medium = layers_of(names, form)(parameters)
+    angle = float(np.radians(INCIDENCE_DEG))
+    reflectance = np.empty((len(parameters), len(WAVELENGTHS)))
+    alike = [i for i, name in enumerate(names) if name.startswith("index_")]
+    _, group = np.unique(parameters[:, alike], axis=0, return_inverse=True)
+    parts = tuple(math.ceil(n * order / ADDING_ORDER) for n in ADDING_PARTS)
+    for number in range(group.max() + 1):
+        rows = np.flatnonzero(group == number)
+        some = skin.side_by_side(jax.tree.map(lambda a, rows=rows: a[rows], medium))
+        found = adding.skin(some, incidence=angle, order=order, dtype=np.float32, parts=parts)
+        reflectance[rows] = np.asarray(found.reflectance).reshape(len(rows), -1)
+    return reflectance
 
 
-def surface_share(specimen: Specimen) -> float:
-    """What the surface reflects at once at the table's angle of incidence."""
-    return fresnel.surface_reflectance(
-        float(np.radians(INCIDENCE_DEG)), 1.0, specimen.index_corneum, specimen.roughness
-    )
+def surface_share(parameters: np.ndarray) -> np.ndarray:
+    """What the surface reflects at once at the table's angle of incidence, (rows,)."""
+    angle = float(np.radians(INCIDENCE_DEG))
+    curve = fresnel.surface_curve(angle, Specimen().roughness)
+    return curve(parameters[:, NAMES.index("index_corneum")])
 
 
 # --- storing ----------------------------------------------------------------------------------
 
 COLUMNS = ("reflectance", "standard_error", "design", "form", "parameter", "lower", "upper")
-ATTRIBUTES = ("hylios_fit", "seed", "rays", "generator", "surface", "incidence_deg")
+ATTRIBUTES = ("hylios_fit", "seed", "rays", "generator", "incidence_deg")
 
 
-def _empty(
-    rows: int, seed: int, rays: int, generator: str = "walker", share: int | None = None
-) -> xarray.Dataset:
+def _empty(rows: int, seed: int, rays: int, generator: str = "walker") -> xarray.Dataset:
     import xarray
 
     from hylios_fit import __version__
 
-    parameters, form = design(rows, seed, share)
+    parameters, form = design(rows, seed, generator)
     blank = np.full((rows, len(WAVELENGTHS)), np.nan, np.float32)
     unit = {"units": "1"}
 
@@ -263,9 +299,8 @@ def _empty(
             "hylios_fit": __version__,
             "seed": seed,
             "rays": rays,
-            "rows_sharing_paths": share or SHARE,
+            "rows_of_a_group": SHARE,
             "generator": generator,
-            "surface": surface_share(Specimen()),
             "incidence_deg": INCIDENCE_DEG,
         },
     )
@@ -363,7 +398,6 @@ def generate(
     progress: bool = True,
     threads: int = 2,
     generator: str = "walker",
-    share: int | None = None,
     executor: Executor | None = None,
 ) -> Path:
     """Make the table at `path`, go on with it, or append rows to it.
@@ -377,8 +411,6 @@ def generate(
         rays: of each set of paths (walker).
         threads: chunks of rows that are made at once, without an `executor`.
         generator: one of `GENERATORS`.
-        share: rows of a group, which agree in what changes paths; the walker has `SHARE`, the
-            others 1.
         executor: where the chunks are made, instead of threads; for a Dask cluster that shares
             the folder, `dask.distributed.Client(...).get_executor()`.
 
@@ -390,11 +422,7 @@ def generate(
     path = Path(path)
     if generator not in GENERATORS:
         raise HyliosError(f"generator is one of {', '.join(GENERATORS)}, got {generator!r}")
-    walks = generator == "walker"
-    share = share or (SHARE if walks else 1)
-    if (walks and share != SHARE) or (GROUPS * SHARE) % share:
-        raise HyliosError(f"{share} rows in a group: the {generator} cannot")
-    rays = rays if walks else 0
+    rays = rays if generator == "walker" else 0
     step = len(FORMS) * GROUPS * SHARE
     if rows is not None and (rows < step or rows % step):
         raise HyliosError(f"a table has a multiple of {step} rows, asked for {rows}")
@@ -402,8 +430,8 @@ def generate(
         raise HyliosError(f"{path} exists; add --resume to go on with it, or choose another name")
     with _writing(path):
         if not path.exists():
-            _begin(path, _empty(rows or ROWS, seed, rays, generator, share), step)
-        asked = {"generator": generator, "seed": seed, "rays": rays, "rows_sharing_paths": share}
+            _begin(path, _empty(rows or ROWS, seed, rays, generator), step)
+        asked = {"generator": generator, "seed": seed, "rays": rays, "rows_of_a_group": SHARE}
         total = _extend(path, rows, asked)
     done = _done(path)
     starts = [s for s in range(0, total, step) if not done[s : s + step].all()]
@@ -496,7 +524,7 @@ def _extend(path: Path, rows: int | None, asked: dict[str, Any]) -> int:
         total = old if rows is None else rows
         if total < old:
             raise HyliosError(f"{path} has {old} rows, asked for {total}: a table does not shrink")
-        parameters, form = design(total, asked["seed"], asked["rows_sharing_paths"])
+        parameters, form = design(total, asked["seed"], asked["generator"])
         names = tuple(store["parameter"][:])
         if names != NAMES or not np.array_equal(store["design"][:old], parameters[:old]):
             raise HyliosError(

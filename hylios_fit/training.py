@@ -1,16 +1,29 @@
-"""Table -> surrogate: principal components, a regression by scikit-learn, an honest error."""
+"""Table -> surrogate: a local regression, principal components, a regression, an honest error.
+
+A wavelength knows of a specimen only what its layers absorb and scatter there: some twenty numbers.
+So the table is first learned as a function of those, all wavelengths of all rows together, which
+makes millions of examples of it (`_learn_locally`). That function then answers for as many more
+specimens as the regression on the principal components (`_fit`) needs, at the cost of a product of
+matrices each, and for parameters that act through the layers alone whether or not the table has an
+axis for them (`index_dispersion`).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from hylios_fit.statevector import state_vector
+from hylios_fit import fresnel
+from hylios_fit.skin import Layers, Specimen
+from hylios_fit.statevector import PRIORS, derived, state_vector
 from hylios_fit.surrogate import (
     FLOOR,
     Surrogate,
@@ -20,16 +33,24 @@ from hylios_fit.surrogate import (
     load_surrogate,
     save,
 )
-from hylios_fit.table import add_rows, read_table
+from hylios_fit.table import SHARE, layers_of, read_table, solve_rows, spread
 
-COMPONENTS = 32
-HIDDEN = (128, 128)
-EPOCHS = 3200  # over all rates
-RATES = ((3e-3, 0.25), (1e-3, 0.25), (3e-4, 0.25), (1e-4, 0.125), (3e-5, 0.125))  # share of epochs
-BATCH = 128
+FURTHER = {"index_dispersion": (-0.005, 0.035)}
+"""Ranges of parameters that the table has no axis for and its indices cover."""
+LOCAL_HIDDEN = (128, 128, 64)
+LOCAL_STEPS = 120_000
+LOCAL_BATCH = 2048
+SPECIMENS = 131_072  # of each form, that the local regression answers for
+COMPONENTS = 48
+HIDDEN = (160, 160)
+STEPS = 200_000
+BATCH = 256
+RATES = tuple((3e-3 * 0.5**k, 1 / 9) for k in range(9))  # and the share of the steps
 LEAST_ROWS = 64  # of each form
+CHECK_ORDER = 8  # of the solver that they are held against
 CHECKS = 256  # fresh specimens of each form that measure the error
 MODES = 32
+REGIONS = 12  # of the box, that `check` names
 THREADS = 2
 
 
@@ -43,21 +64,31 @@ def train(
     """Train on the table and write the surrogate; returns the report that `check` prints.
 
     Its error is measured on `checks` fresh specimens of each form, drawn from the prior of the
-    fits and solved without noise by adding-doubling, whichever generator made the table.
+    fits with every parameter free and solved without noise by adding-doubling, whichever generator
+    made the table.
     """
     from hylios_fit import __version__
 
     table = read_table(table_path, LEAST_ROWS)
     forms = tuple(str(table["form"].attrs["flag_meanings"]).split())
-    names = tuple(str(name) for name in table["parameter"].values)
-    surface = float(table.attrs["surface"])
     nm = table["wavelength_nm"].values
+    box = {
+        str(name): (float(low), float(high))
+        for name, low, high in zip(
+            table["parameter"].values, table["lower"].values, table["upper"].values, strict=True
+        )
+    } | FURTHER
+    names = tuple(box)
+    curve = fresnel.surface_curve(
+        float(np.radians(table.attrs["incidence_deg"])), Specimen().roughness
+    )
     arrays: dict[str, np.ndarray] = {
         "wavelength_nm": nm,
-        "lower": table["lower"].values,
-        "upper": table["upper"].values,
+        "lower": np.array([low for low, _ in box.values()]),
+        "upper": np.array([high for _, high in box.values()]),
+        "fresnel": curve.convert(domain=(0.5, 2.5)).coef,
     }
-    for form, fitted in _fits(table, names, forms, surface, seed, progress).items():
+    for form, fitted in _fits(table, box, forms, curve, seed, progress).items():
         parts = {**fitted, "modes": np.zeros((1, nm.size)), "rest": np.zeros(nm.size)}
         arrays.update({f"{form}/{name}": a.astype(np.float32) for name, a in parts.items()})
 
@@ -65,45 +96,53 @@ def train(
         "hylios_fit": __version__,
         "names": list(names),
         "forms": list(forms),
-        "surface": surface,
         "incidence_deg": float(table.attrs["incidence_deg"]),
         "generator": table.attrs["generator"],
         "rows": int(table.sizes["row"]),
         "rays": int(table.attrs["rays"]),
-        "rows_sharing_paths": int(table.attrs["rows_sharing_paths"]),
+        "rows_of_a_group": int(table.attrs["rows_of_a_group"]),
         "table_seed": int(table.attrs["seed"]),
         "seed": seed,
         "depth": len(HIDDEN) + 1,
         "held_out": f"{checks} fresh specimens of each form, by adding-doubling",
         "held_out_rms": {},
         "held_out_most": {},
+        "regions": {},
     }
     found = _check(assemble(arrays, about), seed, checks, progress)
-    for form, (modes, rest, error) in found.items():
+    for form, (modes, rest, error, drawn) in found.items():
         arrays[f"{form}/modes"] = modes.astype(np.float32)
         arrays[f"{form}/rest"] = rest.astype(np.float32)
         rms = np.sqrt(np.mean(error**2, axis=0))
         about["held_out_rms"][form] = [round(float(value), 6) for value in rms]
         about["held_out_most"][form] = round(float(np.quantile(np.abs(error), 0.999)), 6)
+        about["regions"][form] = _regions(names, drawn, error)
     path = save(out_path, arrays, about)
     return check_report(load_surrogate(path))
 
 
-def fresh(parameters: np.ndarray, form: str) -> np.ndarray:
-    """Reflectance (w,) of one specimen (P,), without noise."""
-    return add_rows(parameters[None], form)[0][0]
+def fresh(member: Any, count: int, key: Array) -> np.ndarray:
+    """(count, P) specimens from the prior with every parameter free; `SHARE` in turn have the same
+    refractive indices, so that they can be solved together."""
+    names = member.names
+    vector = state_vector(names, member.lower, member.upper, free=names)
+    drawn = vector.prior_draws(key, count)
+    alike = [i for i, name in enumerate(names) if name.startswith("index_")]
+    first = np.arange(count) // SHARE * SHARE
+    drawn[:, alike] = drawn[first][:, alike]
+    return drawn
 
 
 def _check(
     surrogate: Surrogate, seed: int, checks: int, progress: bool
-) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """By form: modes and rest of the logarithm's error, and the error in reflectance (n, w)."""
+) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """By form: modes and rest of the logarithm's error, the error in reflectance (n, w), and the
+    specimens (n, P)."""
     from tqdm import tqdm
 
     key = jax.random.fold_in(jax.random.key(seed), 1)
-    member = surrogate.at(surrogate.forms[0])
-    vector = state_vector(member.names, member.lower, member.upper)
-    drawn = vector.prior_draws(key, checks)  # the same for each form
+    # the same for each form
+    drawn = fresh(surrogate.at(surrogate.forms[0]), checks, key)
     found = {}
     total = checks * len(surrogate.forms)
     with (
@@ -112,18 +151,129 @@ def _check(
     ):
         for form in surrogate.forms:
             member = surrogate.at(form)
-            truth = np.empty((checks, len(member.wavelength_nm)))
-            for i, one in enumerate(pool.map(lambda row, form=form: fresh(row, form), drawn)):
-                truth[i] = one
-                bar.update()
-            error = np.asarray(member(jnp.asarray(drawn, jnp.float32)), float) - truth
-            scaled = error / member.error_scale(truth)
-            found[form] = (*_error(scaled, len(member.names)), error)
+            lots = [drawn[i : i + SHARE] for i in range(0, checks, SHARE)]
+            truth = []
+            for lot in pool.map(partial(solve, member.names, form), lots):
+                truth.append(lot)
+                bar.update(len(lot))
+            error = np.asarray(member(jnp.asarray(drawn, jnp.float32)), float)
+            error = error - np.concatenate(truth)
+            scaled = error / member.error_scale(np.concatenate(truth))
+            found[form] = (*_error(scaled, len(PRIORS)), error, drawn)
     return found
 
 
+def _regions(
+    names: tuple[str, ...], drawn: np.ndarray, error: np.ndarray
+) -> list[tuple[str, float, float]]:
+    """(what of the box, RMS and largest error there), worst first: each third of the specimens by
+    every parameter and every quantity that follows from them."""
+    columns = dict(zip(names, drawn.T, strict=True)) | dict(derived(names, drawn))
+    found = []
+    for name, values in columns.items():
+        low, high = np.quantile(values, [1 / 3, 2 / 3])
+        thirds = {
+            f"{name} below {low:.3g}": values < low,
+            f"{name} {low:.3g} to {high:.3g}": (values >= low) & (values <= high),
+            f"{name} above {high:.3g}": values > high,
+        }
+        for text, mine in thirds.items():
+            if mine.any():
+                rms = float(np.sqrt(np.mean(error[mine] ** 2)))
+                found.append((text, round(rms, 6), round(float(np.abs(error[mine]).max()), 6)))
+    return sorted(found, key=lambda row: -row[1])[:REGIONS]
+
+
+def solve(names: tuple[str, ...], form: str, rows: np.ndarray) -> np.ndarray:
+    """Reflectance (n, w) without noise, finer than the table's."""
+    return solve_rows(names, rows, form, CHECK_ORDER)
+
+
+# --- the local regression -----------------------------------------------------------------------
+
+
+def local_features(layers: Layers) -> Float[Array, "w f"]:
+    """What one wavelength knows of the layers: optical depths, hits, indices, and a rough guess.
+
+    The guess is that of Kubelka and Munk for the reticular dermis over its bottom, seen through
+    what lies above and from below the surface.
+    """
+    depth = layers.thickness[:, None]
+    absorbed = layers.mu_a * depth
+    hits = layers.mu_particle[1:4] * depth[1:4]
+    lost = 1.0 - layers.hit_albedo[1:4]
+    fibre = layers.mu_fibre * depth[4, 0]
+    tissue = layers.mu_tissue[5] * depth[5]
+    bottom = layers.bottom * jnp.ones_like(fibre)
+    index = layers.index[jnp.array([0, 1, 4, 5])]
+    steps = jnp.sqrt((index[1:] - index[:-1]) ** 2 + 1e-5)
+
+    k, s = 2.0 * absorbed[5], 0.75 * tissue
+    x = jnp.sqrt(k * (k + 2.0 * s) + 1e-6)
+    fade = jnp.exp(-2.0 * x)
+    sinh, cosh = 0.5 * (1.0 - fade) / x, 0.5 * (1.0 + fade)  # over x exp(x), and over exp(x)
+    dermis = s * sinh * (1.0 - bottom) + bottom * (cosh - k * sinh)
+    dermis = jnp.clip(dermis / (cosh + (k + s * (1.0 - bottom)) * sinh), 0.0, 1.0)
+    back = 0.5 * (1.0 - jnp.exp(-1.5 * fibre))
+    through = (1.0 - back) * jnp.exp(-2.0 * absorbed[4])
+    dermis = back + through**2 * dermis / (1.0 - back * dermis)
+    pigment = jnp.sum(absorbed[1:4] + hits * lost, axis=0)
+    above = jnp.exp(-4.0 * (absorbed[0] + pigment))
+    guess = above * dermis / (1.0 - 0.5 * above * dermis)
+    rows = [
+        jnp.log(absorbed + 1e-3), jnp.sqrt(absorbed + 1e-4), jnp.log(hits + 0.05),
+        jnp.log(lost + 1e-3), jnp.log(hits * lost + 1e-3), layers.theta_0[None],
+        jnp.log(fibre + 0.02)[None], jnp.log(tissue + 0.1)[None], jnp.sqrt(tissue + 0.01)[None],
+        bottom[None], index, steps, jnp.log(pigment + 1e-3)[None],
+        jnp.log(pigment + absorbed[0] + 1e-3)[None],
+        jnp.log(absorbed[4] + absorbed[5] + 1e-3)[None],
+        dermis[None], guess[None], jnp.log(guess + 0.05)[None],
+    ]  # fmt: skip
+    return jnp.concatenate(rows).T
+
+
+@lru_cache(maxsize=8)
+def _inputs(names: tuple[str, ...], form: str) -> Callable[[Array], Float[Array, "n w f"]]:
+    of = layers_of(names, form)
+    return jax.jit(lambda rows: jax.vmap(local_features)(of(rows)))
+
+
+def _learn_locally(
+    x: np.ndarray, log: np.ndarray, noise: np.ndarray, seed: int, bar: Any
+) -> Callable[[Array], Array]:
+    """From local features (n, w, f), what they give (n, w) and its variance: features -> that."""
+    x = x.reshape(-1, x.shape[-1])
+    centre, scale = x.mean(axis=0), x.std(axis=0) + 1e-6
+    middle, unit = float(log.mean()), float(log.std())
+    y = ((log - middle) / unit).astype(np.float32).reshape(-1)
+    variance = float(noise.mean()) / unit**2
+    network = _network(
+        (x - centre) / scale, y, LOCAL_HIDDEN, LOCAL_STEPS, LOCAL_BATCH, variance, seed, bar
+    )
+    weights = [jnp.asarray(w, jnp.float32) for w in network.coefs_]
+    biases = [jnp.asarray(b, jnp.float32) for b in network.intercepts_]
+
+    def answer(x: Array) -> Array:
+        x = (x - centre) / scale
+        for i, (w, b) in enumerate(zip(weights, biases, strict=True)):
+            x = x @ w + b
+            if i < len(weights) - 1:
+                x = jnp.tanh(x)
+        return x[..., 0] * unit + middle
+
+    return jax.jit(answer)
+
+
+def _lots(rows: np.ndarray, size: int = 64) -> list[Array]:
+    """Rows in lots of one size, but for the last: what they need stays small."""
+    return [jnp.asarray(rows[i : i + size], jnp.float32) for i in range(0, len(rows), size)]
+
+
+# --- the regression on principal components -----------------------------------------------------
+
+
 def _fits(
-    table: Any, names: tuple[str, ...], forms: tuple[str, ...], surface: float, seed: int,
+    table: Any, box: dict[str, tuple[float, float]], forms: tuple[str, ...], curve: Any, seed: int,
     progress: bool,
 ) -> dict[str, dict[str, np.ndarray]]:  # fmt: skip
     """By form: every number of the fitted pipeline by name."""
@@ -134,9 +284,13 @@ def _fits(
     from threadpoolctl import threadpool_limits
     from tqdm import tqdm
 
+    axes = tuple(str(name) for name in table["parameter"].values)
+    rows = table["design"].values
+    specimens = _specimens(box, dict(zip(axes, table["spread"].values, strict=True)), seed)
+    surface = curve(rows[:, axes.index("index_corneum"), None])
     with (
         tqdm(
-            total=len(forms) * len(RATES), desc="train", unit="stage", disable=not progress
+            total=2 * len(forms) * len(RATES), desc="train", unit="stage", disable=not progress
         ) as bar,
         warnings.catch_warnings(),
         threadpool_limits(1),
@@ -145,45 +299,79 @@ def _fits(
         warnings.simplefilter("ignore", ConvergenceWarning)  # the epochs are fixed beforehand
 
         def one(number: int) -> dict[str, np.ndarray]:
-            mine = table["form"].values == number
-            design = jnp.asarray(table["design"].values[mine], jnp.float32)
-            share, noise = (
-                table[name].values[mine].astype(float) / (1.0 - surface)
-                for name in ("reflectance", "standard_error")
-            )
-            share = np.clip(share - surface / (1.0 - surface), 0.0, None)
-            x = np.asarray(features(names, design), float)
-            return _fit(x, np.log(share + FLOOR), noise / (share + FLOOR), seed, bar)
+            mine, form = table["form"].values == number, forms[number]
+            at = surface[mine]
+            share = (table["reflectance"].values[mine] - at) / (1.0 - at)
+            share = np.clip(share, 0.0, None) + FLOOR
+            noise = (table["standard_error"].values[mine] / (1.0 - at) / share) ** 2
+            known = _inputs(axes, form)
+            x = np.concatenate([np.asarray(known(lot)) for lot in _lots(rows[mine])])
+            answer = _learn_locally(x, np.log(share), noise, seed, bar)
+            del x
+            more = _inputs(tuple(box), form)
+            log = np.concatenate([np.asarray(answer(more(lot))) for lot in _lots(specimens)])
+            x = features(tuple(box), form, jnp.asarray(specimens, jnp.float32))
+            return _fit(np.asarray(x, float), log, seed, bar)
 
         return dict(zip(forms, pool.map(one, range(len(forms))), strict=True))
 
 
-def _fit(
-    x: np.ndarray, log: np.ndarray, noise: np.ndarray, seed: int, bar: Any
-) -> dict[str, np.ndarray]:
-    """Standardise, reduce, regress: features (n, f), and what they give with its noise (n, w)."""
-    from sklearn.decomposition import PCA
+def _specimens(
+    box: dict[str, tuple[float, float]], spreads: dict[str, str], seed: int
+) -> np.ndarray:
+    """(SPECIMENS, P): half spread over the box as the table is, half drawn from the prior."""
+    from scipy.stats import qmc
+
+    half = SPECIMENS // 2
+    unit = qmc.Sobol(len(box), rng=np.random.default_rng([seed, 2])).random(half)
+    over = [
+        spread(u, low, high, spreads.get(name, "linear"))
+        for u, (name, (low, high)) in zip(unit.T, box.items(), strict=True)
+    ]
+    vector = state_vector(
+        tuple(box), [low for low, _ in box.values()], [high for _, high in box.values()], tuple(box)
+    )
+    drawn = vector.prior_draws(jax.random.fold_in(jax.random.key(seed), 2), SPECIMENS - half)
+    return np.concatenate([np.stack(over, axis=1), drawn])
+
+
+def _network(
+    x: np.ndarray, y: np.ndarray, hidden: tuple[int, ...], steps: int, batch: int,
+    variance: float, seed: int, bar: Any,
+) -> Any:  # fmt: skip
+    """A perceptron of about `steps` batches.
+
+    The penalty is that of the most probable weights, where they have variance 1/width and each
+    target has noise of this variance.
+    """
     from sklearn.neural_network import MLPRegressor
+
+    lot: Any = min(batch, len(x))
+    network: Any = MLPRegressor(
+        hidden_layer_sizes=hidden, activation="tanh", solver="adam", batch_size=lot,
+        alpha=variance * max(hidden) * lot / len(x),  # the penalty is added in every batch
+        warm_start=True, tol=0.0, n_iter_no_change=10**9, random_state=seed,
+    )  # fmt: skip
+    for rate, share in RATES:
+        epochs = max(round(share * steps * lot / len(x)), 1)
+        network.set_params(learning_rate_init=rate, max_iter=epochs)
+        network.fit(x, y)
+        bar.update()
+    return network
+
+
+def _fit(x: np.ndarray, log: np.ndarray, seed: int, bar: Any) -> dict[str, np.ndarray]:
+    """Standardise, reduce, regress: features (n, f), and what they give (n, w)."""
+    from sklearn.decomposition import PCA
     from sklearn.preprocessing import StandardScaler
 
     scaler: Any = StandardScaler().fit(x)
     pca: Any = PCA(min(COMPONENTS, len(x) // 4), random_state=seed).fit(log)
     scores = pca.transform(log)
     unit = scores[:, 0].std()  # one scale for all, so that what matters more weighs more
-    # the most probable weights, where they have variance 1/width and each score this much noise
-    variance = np.mean(np.sum(noise**2, axis=1)) / unit**2 / scores.shape[1]
-    batch: Any = min(BATCH, len(x))
-    network = MLPRegressor(
-        hidden_layer_sizes=HIDDEN, activation="tanh", solver="adam", batch_size=batch,
-        alpha=variance * max(HIDDEN) * batch / len(x),  # the penalty is added in every batch
-        warm_start=True, tol=0.0, n_iter_no_change=EPOCHS, random_state=seed,
-    )  # fmt: skip
     inputs = scaler.transform(x).astype(np.float32)
     targets = (scores / unit).astype(np.float32)
-    for rate, share in RATES:
-        network.set_params(learning_rate_init=rate, max_iter=max(round(share * EPOCHS), 1))
-        network.fit(inputs, targets)
-        bar.update()
+    network = _network(inputs, targets, HIDDEN, STEPS, BATCH, 0.0, seed, bar)
     weights = [np.asarray(w, float) for w in network.coefs_]
     biases = [np.asarray(b, float) for b in network.intercepts_]
     weights[-1], biases[-1] = weights[-1] * unit, biases[-1] * unit
@@ -192,8 +380,8 @@ def _fit(
         "scale": scaler.scale_,
         "components": pca.components_,
         "mean": pca.mean_,
-        **{f"weight{i}": w[None] for i, w in enumerate(weights)},
-        **{f"bias{i}": b[None] for i, b in enumerate(biases)},
+        **{f"weight{i}": w for i, w in enumerate(weights)},
+        **{f"bias{i}": b for i, b in enumerate(biases)},
     }
 
 

@@ -75,7 +75,7 @@ class _Medium(NamedTuple):
     """Per-layer numbers of the walk; k columns. A seventh layer is the papillary dermis after the
     fibre event of a pass. Tables by layer and column are flat."""
 
-    thickness: Array  # (7,)
+    thickness: Array  # (7,), or (7 k,) where specimens stand side by side
     index: Array  # (8 k,): air, the layers, below
     event: Array  # (7 k,): rate of particles, fibres or tissue
     absorb: Array  # (7 k,)
@@ -86,7 +86,7 @@ class _Medium(NamedTuple):
     particle: Array  # (3,): size of the particle relative to that in the basale
     axes: Array  # (2,): a, b in the basale (a sphere's radius twice)
     facets: Array
-    bottom: Array  # share that the bottom sends back on the walk
+    bottom: Array  # share that the bottom sends back on the walk, (k,) as the thickness
     one: Array  # 1, for `_keep`
 
 
@@ -197,6 +197,12 @@ def _pick(table: Array, layer: Array) -> Array:
     return out
 
 
+def _thickness(m: _Medium, layer: Array, hero: Array) -> Array:
+    if m.thickness.shape[0] == 7:
+        return _pick(m.thickness, layer)
+    return _at(m.thickness, jnp.maximum(layer, 0) * (m.event.shape[0] // 7) + hero)
+
+
 def _at(table: Array, place: Array) -> Array:
     return table.at[place].get(mode="promise_in_bounds")
 
@@ -290,7 +296,7 @@ def _step(
     absorb = _at(m.absorb, row)
     event = _at(m.event, row)
     rate = event + absorb
-    thickness = _pick(m.thickness, layer)
+    thickness = _thickness(m, layer, hero)
     ahead = jnp.where(lane.u[2] > 0, thickness - lane.depth, lane.depth)
     ahead = ahead / jnp.maximum(jnp.abs(lane.u[2]), 1e-12)
     reach = -jnp.log(u1) / jnp.maximum(rate, 1e-30)
@@ -358,7 +364,8 @@ def _step(
     valid, passes = _keep(m, _number(valid, dtype), _number(transmitted, dtype))
     refracted = _keep(m, *refracted)
     bottom = beyond == 6
-    lost = here & bottom & (u3 >= m.bottom)
+    kept = _at(m.bottom, hero) if m.bottom.ndim else m.bottom
+    lost = here & bottom & (u3 >= kept)
     done = here & ((valid > 0) | bottom)
     passes = done & (passes > 0) & ~bottom
     sin_b = jnp.sqrt(u9)
@@ -369,7 +376,7 @@ def _step(
     )
     layer = jnp.where(passes, beyond, jnp.where(fibre, 6, jnp.where(done, layer, lane.layer)))
     top = u[2] > 0
-    depth = jnp.where(done, jnp.where(top, 0.0, _pick(m.thickness, layer)), depth)
+    depth = jnp.where(done, jnp.where(top, 0.0, _thickness(m, layer, hero)), depth)
 
     happened = [hit & (lane.layer == i) for i in (1, 2, 3)]
     happened += [met & (lane.layer == i) for i in (1, 2, 3)]

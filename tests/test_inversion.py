@@ -338,7 +338,7 @@ def test_what_is_no_skin_is_outside_the_range(values):
 
 def test_specular_excluded_subtracts_the_surface():
     values = reflectance(LIGHT, VISIBLE)[0]
-    surface = TOY.at("complex").surface
+    surface = TOY.at("complex").surface_at(None)
     included, excluded = one(values), one(values - surface, specular="excluded")
     np.testing.assert_allclose(excluded.z, included.z, atol=1e-6)
     np.testing.assert_allclose(excluded.fitted, included.fitted - surface, atol=1e-8)

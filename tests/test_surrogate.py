@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from hylios_fit import fresnel, table, training
 from hylios_fit import surrogate as module
-from hylios_fit import table, training
 from hylios_fit.datasets import data_path
 from hylios_fit.errors import HyliosError
 from hylios_fit.skin import Specimen
@@ -50,7 +50,7 @@ def test_outside_the_range_is_an_error_with_names_and_ranges(surrogate):
         surrogate(vector(surrogate, water=0.2))
     with pytest.raises(HyliosError, match="melanosome_form"):
         surrogate(vector(surrogate, melanosome_form="compact"))
-    with pytest.raises(HyliosError, match="expected 12 parameters"):
+    with pytest.raises(HyliosError, match="expected 35 parameters"):
         surrogate(jnp.zeros(3))
     with pytest.raises(HyliosError, match="was not trained on roughness"):
         surrogate.of(Specimen().replace(roughness=0.2), [500.0])
@@ -142,7 +142,7 @@ def test_the_error_of_a_wide_band_is_that_of_its_wavelengths_together(surrogate)
     weights = np.zeros((2, 451))
     weights[0, 40:60], weights[1, 300:400] = 1.0, np.linspace(0.1, 1, 100)
     weights /= weights.sum(axis=1, keepdims=True)
-    surface = float(member.surface)
+    surface = weights @ member.surface
     modes = np.asarray(member.modes, float)
     level = weights @ typical
     expected = (modes * typical) @ weights.T / level  # relative, as each mode moves the band
@@ -328,51 +328,59 @@ def test_a_pickle_is_not_loaded(tmp_path):
         load_surrogate(path)
 
 
-def stand_in(parameters, form):
-    nm = table.WAVELENGTHS
-    at = dict(zip(table.NAMES, parameters.T, strict=True))
-    depth = np.outer(at["colloidal_melanin"] * at["eumelanin"] / 500, (500 / nm) ** 3)
-    depth = depth + np.outer(at["water"], np.exp(-((nm - 1900) ** 2) / 2e5)) + form[:, None] * 0.1
-    return 0.05 + 0.6 * np.exp(-depth)
+def stand_in(names, form, rows):
+    """Light that fades in the layers, under their surface: of what a wavelength knows alone."""
+    medium = table.layers_of(tuple(names), form)(rows)
+    depth = jnp.sum(medium.mu_a * medium.thickness[..., None], axis=1)
+    curve = fresnel.surface_curve(np.radians(table.INCIDENCE_DEG), 0.1)
+    surface = curve(np.asarray(medium.index[:, 0], float))
+    return surface + (1.0 - surface) * 0.6 * np.exp(-np.asarray(depth, float))
 
 
 @pytest.fixture
 def quick(monkeypatch):
     """Small networks, few specimens, and the stand-in also where training checks itself."""
+    monkeypatch.setattr(training, "solve", stand_in)
+    for name, value in (
+        ("HIDDEN", (24, 24)), ("STEPS", 2000), ("LOCAL_HIDDEN", (16, 16)), ("LOCAL_STEPS", 900),
+        ("SPECIMENS", 1024), ("COMPONENTS", 16),
+    ):  # fmt: skip
+        monkeypatch.setattr(training, name, value)
 
-    def fresh(parameters, form):
-        return stand_in(parameters[None], np.array([table.FORMS.index(form)]))[0]
 
-    monkeypatch.setattr(training, "fresh", fresh)
-    monkeypatch.setattr(training, "HIDDEN", (16, 16))
-    monkeypatch.setattr(training, "EPOCHS", 400)
-
-
-def filled(path, rows=512, noise=1e-4):
+def filled(path, rows=128, noise=1e-4):
     """A table with a smooth stand-in for the walk."""
     import zarr
 
     table._empty(rows, 1, 64).to_zarr(path, consolidated=False, zarr_format=3)
     store = zarr.open_group(path, mode="r+")
     parameters, form = table.design(rows, 1)
-    exact = stand_in(parameters, form)
+    exact = np.empty((rows, len(table.WAVELENGTHS)))
+    for number, name in enumerate(table.FORMS):
+        exact[form == number] = stand_in(table.NAMES, name, parameters[form == number])
     store["reflectance"][:] = exact + noise * np.random.default_rng(0).normal(size=exact.shape)
     store["standard_error"][:] = np.full(exact.shape, noise)
-    return parameters, form, exact
+    # what the table has no axis for is nothing
+    rest = len(training.FURTHER)
+    return np.column_stack([parameters, np.zeros((rows, rest)), form]), exact
 
 
 def test_training_learns_a_smooth_table_and_states_its_error(tmp_path, quick):
-    parameters, form, exact = filled(tmp_path / "table.zarr")
+    rows, exact = filled(tmp_path / "table.zarr")
     report = training.train(tmp_path / "table.zarr", tmp_path / "s.npz", checks=64, progress=False)
     trained = load_surrogate(tmp_path / "s.npz")
-    rows = np.column_stack([parameters, form]).astype(np.float32)
-    residual = np.asarray(trained(jnp.asarray(rows))) - exact
+    inside = np.all((rows[:, :-1] >= trained.at("complex").lower), axis=1)
+    inside &= np.all((rows[:, :-1] <= trained.at("complex").upper), axis=1)  # for the shift
+    residual = np.asarray(trained(rows[inside])) - exact[inside]
     rms = np.sqrt(np.mean(residual**2))
     assert rms < 0.01
     stated = np.sqrt(np.mean(np.square(list(trained.about["held_out_rms"].values()))))
     assert 0.2 * rms < stated < 4 * rms  # of other specimens than the rows, so not the same
     assert "worst band" in report
     assert "melanosome_form" in report
+    regions = trained.about["regions"]["complex"]
+    assert [rms for _, rms, _ in regions] == sorted((rms for _, rms, _ in regions), reverse=True)
+    assert regions[0][0] in report
 
 
 def test_training_ignores_unfinished_rows_and_says_when_too_few(tmp_path):
@@ -401,9 +409,35 @@ def test_the_error_is_that_of_the_check_widened_for_its_size():
     assert np.allclose(widened, 19 / 7 * np.mean(seen[:20] ** 2, axis=0), rtol=0.03)
 
 
-def test_noisy_rows_are_smoothed_by_as_much_as_their_standard_errors_say(tmp_path, quick):
-    noisy = filled(tmp_path / "noisy.zarr", noise=0.02)
+def test_noisy_rows_are_smoothed(tmp_path, quick):
+    rows, exact = filled(tmp_path / "noisy.zarr", noise=0.02)
     training.train(tmp_path / "noisy.zarr", tmp_path / "n.npz", checks=8, progress=False)
-    rows = np.column_stack([noisy[0], noisy[1]]).astype(np.float32)
-    fitted = np.asarray(load_surrogate(tmp_path / "n.npz")(jnp.asarray(rows)))
-    assert np.sqrt(np.mean((fitted - noisy[2]) ** 2)) < 0.6 * 0.02
+    trained = load_surrogate(tmp_path / "n.npz")
+    inside = np.all((rows[:, :-1] >= trained.at("complex").lower), axis=1)
+    inside &= np.all((rows[:, :-1] <= trained.at("complex").upper), axis=1)
+    fitted = np.asarray(trained(rows[inside]))
+    assert np.sqrt(np.mean((fitted - exact[inside]) ** 2)) < 0.6 * 0.02
+
+
+def test_the_surface_is_that_of_the_corneum_at_each_wavelength(surrogate):
+    member = surrogate.at("complex")
+    p = dict(zip(member.names, Specimen().parameters(member.names), strict=True))
+    p |= {"index_corneum": 1.5, "index_dispersion": 0.02}
+    found = np.asarray(member.surface_at(np.array(list(p.values()))))
+    for i in (0, 50, 450):
+        index = 1.5 + 0.02 * ((500 / member.wavelength_nm[i]) ** 2 - 1)
+        expected = fresnel.surface_reflectance(np.radians(8.0), 1.0, index, 0.1)
+        assert abs(found[i] - expected) < 1e-6
+    camera = member.onto(np.eye(451)[:3].sum(axis=0)[None])
+    assert abs(float(camera.surface_at(np.array(list(p.values())))[0]) - found[:3].mean()) < 1e-6
+
+
+def test_what_the_regression_sees_is_finite_at_the_edges_of_the_box(surrogate):
+    for form in surrogate.forms:
+        member = surrogate.at(form)
+        for edge in (member.lower, member.upper):
+            assert jnp.isfinite(module.features(member.names, form, edge)).all()
+        medium = table.layers_of(member.names, form)(np.stack([member.lower, member.upper]))
+        for part in (0, 1):
+            one = jax.tree.map(lambda a, part=part: a[part], medium)
+            assert jnp.isfinite(training.local_features(one)).all()

@@ -60,8 +60,11 @@ def test_the_design_lies_in_its_ranges_and_fills_them():
     assert parameters.shape == (1024, len(table.NAMES))
     for column, axis in zip(parameters.T, table.DESIGN, strict=True):
         assert axis.source
-        assert axis.lower <= column.min() < column.max() <= axis.upper
+        below, above = table.SHIFT if axis.name.startswith("index_") else (0.0, 0.0)
+        assert axis.lower + below <= column.min() < column.max() <= axis.upper + above
         assert SPECS[axis.name].lower <= axis.lower < axis.upper <= SPECS[axis.name].upper
+        if axis.name.startswith("index_"):
+            continue
         u = (column - axis.lower) / (axis.upper - axis.lower)
         if axis.spread == "log":
             u = np.log(column / axis.lower) / np.log(axis.upper / axis.lower)
@@ -71,23 +74,39 @@ def test_the_design_lies_in_its_ranges_and_fills_them():
     assert list(np.bincount(form)) == [512, 512]
 
 
-@pytest.mark.parametrize("share", [1, table.SHARE])
+def test_the_indices_of_a_row_are_moved_together_as_dispersion_moves_them():
+    from hylios_fit import skin, training
+
+    parameters, _ = table.design(4096, generator="adding")
+    own = np.array([(axis.lower, axis.upper) for axis in table.DESIGN])[table.INDICES]
+    index = parameters[:, table.INDICES]
+    # one shift, of those that there are, brings all four into their ranges
+    least = np.maximum((index - own[:, 1]).max(axis=1), table.SHIFT[0])
+    most = np.minimum((index - own[:, 0]).min(axis=1), table.SHIFT[1])
+    assert np.all(least <= most + 1e-9)
+    assert np.corrcoef(index.T).min() > 0.2
+    reach = np.outer(training.FURTHER["index_dispersion"], skin.dispersion(table.WAVELENGTHS))
+    assert table.SHIFT[0] < reach.min() < reach.max() < table.SHIFT[1]
+
+
+@pytest.mark.parametrize("generator", table.GENERATORS)
 @pytest.mark.parametrize("rows", [32, 50, 100])
-def test_the_first_rows_of_a_larger_design_are_those_of_a_smaller(rows, share):
-    parameters, form = table.design(rows, share=share)
-    more, forms = table.design(512, share=share)
+def test_the_first_rows_of_a_larger_design_are_those_of_a_smaller(rows, generator):
+    parameters, form = table.design(rows, generator=generator)
+    more, forms = table.design(512, generator=generator)
     np.testing.assert_array_equal(parameters, more[:rows])
     np.testing.assert_array_equal(form, forms[:rows])
 
 
-def test_rows_of_a_group_agree_in_what_changes_paths_and_differ_in_the_rest():
-    for share in (1, 4):
-        parameters, _ = table.design(64, share=share)
-        groups = parameters.reshape(-1, share, len(table.NAMES))
-        assert np.all(groups[..., table.PATHS] == groups[:, :1, table.PATHS])
-        for axis in range(len(table.NAMES)):
-            values = 32 // share if table.PATHS[axis] else 32  # each for both forms
-            assert len(np.unique(parameters[:, axis])) == values
+@pytest.mark.parametrize("generator", table.GENERATORS)
+def test_rows_of_a_group_agree_in_what_they_must_and_differ_in_the_rest(generator):
+    parameters, _ = table.design(64, generator=generator)
+    groups = parameters.reshape(-1, table.SHARE, len(table.NAMES))
+    together = table.PATHS if generator == "walker" else table.INDICES
+    assert np.all(groups[..., together] == groups[:, :1, together])
+    for axis in range(len(table.NAMES)):
+        values = 32 // table.SHARE if together[axis] else 32  # each for both forms
+        assert len(np.unique(parameters[:, axis])) == values
 
 
 def test_another_seed_is_another_design():
@@ -101,8 +120,8 @@ def test_a_table_goes_on_where_it_stopped(small, tmp_path, monkeypatch):
     whole = read(make(tmp_path / "whole.zarr", threads=1))
     assert whole["reflectance"].shape == (ROWS, len(table.WAVELENGTHS))
     assert np.all(np.isfinite(whole["reflectance"]))
-    surface = table.surface_share(table.Specimen())
-    assert np.all(whole["reflectance"] >= np.float32(surface))
+    surface = table.surface_share(whole["design"])
+    assert np.all(whole["reflectance"] >= np.float32(surface)[:, None])
     assert np.all(whole["standard_error"] >= 0)
     assert whole["standard_error"].max() > 0
     np.testing.assert_array_equal(whole["design"], table.design(ROWS)[0])
@@ -150,7 +169,7 @@ def test_rows_of_a_group_share_paths_and_agree_with_their_own_walk(small):
     z = (shared[2] - alone[2]) / np.maximum(np.hypot(error[2], its_error[2]), 1e-9)
     assert np.abs(z).max() < 6
     assert np.sqrt(np.mean(z**2)) < 2
-    with pytest.raises(HyliosError, match="must have the same melanosome contents"):
+    with pytest.raises(HyliosError, match="must agree in what changes paths"):
         table.walk_rows(parameters[form == 0][2:6], "complex", jax.random.key(3), 256)
 
 
@@ -174,8 +193,6 @@ def test_tables_that_cannot_be_gone_on_with_are_refused(small, tmp_path):
         make(path, resume=True, generator="adding")
     with pytest.raises(HyliosError, match="generator is one of walker, adding, got 'magic'"):
         make(path, generator="magic")
-    with pytest.raises(HyliosError, match="2 rows in a group: the walker cannot"):
-        make(path, resume=True, share=2)
     with pytest.raises(HyliosError, match="multiple of 8 rows, asked for 12"):
         table.generate(tmp_path / "new.zarr", rows=12, progress=False)
     assert not (tmp_path / "new.zarr").exists()
@@ -187,9 +204,9 @@ def test_other_versions_are_refused(small, tmp_path):
     path = empty(tmp_path / "t.zarr")
     assert table.open_table(path).attrs["rays"] == RAYS
     zarr.open_group(path, mode="r+").attrs["format_version"] = table.FORMAT_VERSION + 1
-    with pytest.raises(HyliosError, match=r"version 2 .* reads version 1"):
+    with pytest.raises(HyliosError, match=r"version 3 .* reads version 2"):
         table.open_table(path)
-    with pytest.raises(HyliosError, match=r"version 2 .* reads version 1"):
+    with pytest.raises(HyliosError, match=r"version 3 .* reads version 2"):
         make(path, resume=True)
 
 
@@ -267,9 +284,8 @@ def test_the_other_generator_writes_the_same_format(small, tmp_path, monkeypatch
     monkeypatch.setattr(table, "add_rows", add_rows)
     rows = table.read_table(make(tmp_path / "t.zarr", generator="adding"), ROWS // 2)
     assert rows.attrs["generator"] == "adding"
-    assert rows.attrs["rows_sharing_paths"] == 1
     assert rows.attrs["rays"] == 0
-    np.testing.assert_array_equal(rows["design"], table.design(ROWS, share=1)[0])
+    np.testing.assert_array_equal(rows["design"], table.design(ROWS, generator="adding")[0])
     np.testing.assert_array_equal(rows["standard_error"], np.float32(1e-6))
     assert set(rows.variables) == set(table._empty(STEP, 0, RAYS).variables)
 
@@ -281,11 +297,12 @@ def test_rows_by_the_solver_are_those_of_their_specimens(monkeypatch):
 
     def solver(layers, *, incidence, order, **_):  # the solver has tests of its own
         assert incidence == pytest.approx(np.radians(table.INCIDENCE_DEG))
-        depth = np.sum((layers.mu_a + layers.mu_particle) * layers.thickness[:, None], axis=0)
+        thickness = layers.thickness.reshape(6, -1)
+        depth = np.sum((layers.mu_a + layers.mu_particle) * thickness, axis=0)
         return SimpleNamespace(reflectance=np.exp(-np.asarray(depth)) + 0.1 / order**2)
 
     monkeypatch.setattr(adding, "skin", solver)
-    parameters = table.design(8, share=1)[0][1:4]
+    parameters = table.design(64, generator="adding")[0][[1, 2, 20]]  # of two groups
     found, error = table.add_rows(parameters, "dispersed")
     assert found.shape == error.shape == (3, len(table.WAVELENGTHS))
     assert np.all(error > 0)

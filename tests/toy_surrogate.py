@@ -38,8 +38,7 @@ class ToyMember(eqx.Module):
     scattering: np.ndarray  # (B,)
     sieve: np.ndarray  # ()
 
-    @property
-    def surface(self):
+    def surface_at(self, parameters):
         return 0.04
 
     def error_covariance(self, reflectance):
@@ -63,7 +62,7 @@ class ToyMember(eqx.Module):
         dermis = p["blood_reticular"] * blood + p["water"] * water + p["lipids"] * lipids + 0.05
         ratio = dermis / self.scattering
         diffuse = 1.0 + ratio - jnp.sqrt(ratio * (ratio + 2.0))
-        return self.surface + 0.93 * jnp.exp(-2.0 * (depth + papillary)) * diffuse
+        return 0.04 + 0.93 * jnp.exp(-2.0 * (depth + papillary)) * diffuse
 
     def on(self, wavelength_nm):
         grid = np.asarray(self.wavelength_nm)
