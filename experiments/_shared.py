@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 import hylios_fit
+from hylios_fit.statevector import PRIORS
+from hylios_fit.table import DESIGN
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CACHE = REPOSITORY / "build" / "experiments"
@@ -20,6 +22,8 @@ CACHE = REPOSITORY / "build" / "experiments"
 WALK = ("absorbers", "counter", "fresnel", "melanosome", "scattering", "skin", "tally", "walker")
 FITTING = ("instrument", "inversion", "spectra", "statevector", "surrogate")
 
+PIGMENTS = tuple(axis for axis in DESIGN if PRIORS[axis.name].usual)
+"""Axes of the design that a fit leaves free unless told otherwise."""
 COLOURS = ("#1b6ca8", "#c8553d", "#3a7d44", "#7a4fa3", "#b58900", "#4d4d4d", "#d1495b", "#2a9d8f")
 BANDS_NM: Mapping[str, tuple[float, float]] = {
     "250-400": (250.0, 400.0),

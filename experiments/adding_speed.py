@@ -14,9 +14,11 @@ import numpy as np
 from experiments import _shared
 from hylios_fit import adding, skin, tally, walker
 from hylios_fit.skin import Specimen
-from hylios_fit.table import NAMES, design
+from hylios_fit.table import NAMES as DESIGNED
+from hylios_fit.table import design, layers_of
 from hylios_fit.units import wavelengths
 
+NAMES = tuple(axis.name for axis in _shared.PIGMENTS)
 PRESETS = ("S1", "S2", "S3", "S4")
 ORDERS = (4, 6, 8, 12, 16)
 FINEST = 32
@@ -73,20 +75,12 @@ def run(seed: int = 0, many: int = MANY, progress: bool = True) -> dict[str, Any
 
 def _many(nm: np.ndarray, count: int) -> dict[str, Any]:
     """Random specimens of the training design, side by side."""
-    parameters, _ = design(2 * count, 1, 1)
+    parameters, form = design(2 * count, 1, "adding")
+    parameters = parameters[form == 0][:, [DESIGNED.index(name) for name in NAMES]]
+    layers = layers_of(NAMES, "complex", stand=False)
     lot, took, energy = 50, 0.0, 0.0
     for first in range(-lot, count, lot):  # one lot more, to compile
-        rows = parameters[::2][max(first, 0) : max(first, 0) + lot]
-        media = []
-        for row in rows:
-            values = {**Specimen().values, **dict(zip(NAMES, row.tolist(), strict=True))}
-            media.append(skin.layers(values, "complex", nm))
-        wide = ("index", "mu_a", "mu_particle", "hit_albedo", "theta_0", "mu_fibre", "mu_tissue")
-        together = media[0]._replace(
-            **{k: jnp.concatenate([getattr(m, k) for m in media], axis=-1) for k in wide},
-            thickness=jnp.repeat(media[0].thickness[:, None], lot * nm.size, axis=1),
-            bottom=jnp.repeat(media[0].bottom[None], lot * nm.size),
-        )
+        together = skin.side_by_side(layers(parameters[max(first, 0) : max(first, 0) + lot]))
         start = time.perf_counter()
         found = jax.block_until_ready(adding.skin(together))
         took += (time.perf_counter() - start) * (first >= 0)

@@ -19,6 +19,12 @@ from hylios_fit.errors import HyliosError
 
 FILE = "nist_skin_reflectance_odd_subjects.csv"
 SHARES = (5, 25, 50, 75, 95)
+BEYOND = (
+    "keratin", "reticular_scattering", "reticular_scattering_power", "bottom_reflectance",
+    "index_epidermis", "index_papillary", "index_reticular", "index_dispersion",
+)  # fmt: skip
+"""What the published model lacks on measured skin, each off or at its value unless it is freed."""
+ESTIMATES = ("melanin_mg_per_mL", "blood_percent", "oxygen_saturation", "water_percent")
 
 
 def spectra_path() -> Path:
@@ -37,7 +43,8 @@ def spectra_path() -> Path:
 
 
 def run(path: Any = None, surrogate: Any = None, progress: bool = True) -> dict[str, Any]:
-    """One row for each spectrum of the file, and what they say together."""
+    """One row for each spectrum of the file, and what they say together; then all once more with
+    what the published model lacks free as well."""
     from hylios_fit.inversion import fit_many
     from hylios_fit.spectra import read_spectra
     from hylios_fit.surrogate import load_surrogate
@@ -45,10 +52,26 @@ def run(path: Any = None, surrogate: Any = None, progress: bool = True) -> dict[
     path = Path(path) if path else spectra_path()
     surrogate = surrogate or load_surrogate()
     spectra = read_spectra(path, wavelength_range=(250.0, 2500.0))
-    fits = fit_many(spectra, surrogate, progress=progress)
-    if [fit.spectrum for fit in fits] != list(spectra.names):
-        raise HyliosError(f"{len(spectra)} spectra, but the rows are not theirs")
-    nm = spectra.wavelength_nm
+    known = surrogate.at(surrogate.forms[0]).names
+    more = ("usual", *(name for name in BEYOND if name in known))
+    published = fit_many(spectra, surrogate, progress=progress)
+    beyond = fit_many(spectra, surrogate, free=more, progress=progress)
+    for fits in (published, beyond):
+        if [fit.spectrum for fit in fits] != list(spectra.names):
+            raise HyliosError(f"{len(spectra)} spectra, but the rows are not theirs")
+    return {
+        "file": path.name,
+        "surrogate": _shared.surrogate_record(surrogate),
+        "wavelengths": len(spectra.wavelength_nm),
+        "spectra": len(spectra),
+        "rows": len(published),
+        **_summary(published),
+        "beyond": {"free": list(more), **_summary(beyond)},
+    }
+
+
+def _summary(fits: list[Any]) -> dict[str, Any]:
+    nm = fits[0].wavelength_nm
     residual = np.array([fit.residual for fit in fits])
     measured = np.array([fit.measured for fit in fits])
     fitted = np.array([fit.fitted for fit in fits])
@@ -56,13 +79,8 @@ def run(path: Any = None, surrogate: Any = None, progress: bool = True) -> dict[
     rms = {name: _rms(residual[:, mask]) for name, mask in masks.items()}
     outcomes = Counter(fit.outcome.code for fit in fits)
     drawn = slice(None, None, max(1, len(nm) // 250))
-    estimates = ("melanin_mg_per_mL", "blood_percent", "oxygen_saturation", "water_percent")
+    estimates = (*ESTIMATES, *(name for name in BEYOND if name in fits[0].names))
     return {
-        "file": path.name,
-        "surrogate": _shared.surrogate_record(surrogate),
-        "wavelengths": len(nm),
-        "spectra": len(spectra),
-        "rows": len(fits),
         "outcomes": {name: outcomes[name] for name in sorted(outcomes)},
         "share_fitted": float(np.mean([fit.outcome.is_fitted for fit in fits])),
         "share_within_noise": float(np.mean([fit.outcome.code == "fitted" for fit in fits])),
@@ -84,7 +102,7 @@ def run(path: Any = None, surrogate: Any = None, progress: bool = True) -> dict[
                 "spectrum": fit.spectrum,
                 "outcome": fit.outcome.code,
                 "residual_rms": _shared.significant(fit.residual_rms),
-                **{name: _shared.significant(fit[name].value) for name in estimates},
+                **{name: _shared.significant(fit[name].value) for name in ESTIMATES},
             }
             for fit in fits
         ],
@@ -106,42 +124,44 @@ def _over(values: np.ndarray, share: float) -> list[float]:
 
 
 def draw(result: dict[str, Any], path: Any) -> None:
-    """Median measured and fitted, the residual's quantiles, and the RMS of each spectrum."""
+    """Median measured and fitted, the residual's quantiles, and the RMS of each spectrum, by the
+    published model and with what it lacks."""
     figure = _shared.figure(9.5, 7.5)
     grid = figure.add_gridspec(2, 2, width_ratios=(2, 1))
     spectrum = figure.add_subplot(grid[0, 0])
     residual = figure.add_subplot(grid[1, 0], sharex=spectrum)
     histogram, bands = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
-    curves = result["curves"]
-    nm = np.array(curves["wavelength_nm"])
-    spectrum.plot(nm, _shared.floats(curves["measured_median"]), color="black", label="measured")
-    spectrum.plot(nm, _shared.floats(curves["fitted_median"]), color="#c8553d", label="fitted")
-    spectrum.legend()
-    _shared.tidy(
-        spectrum, "", "reflectance, median of spectra",
-        f"{result['rows']} spectra of {result['file']}",
-    )  # fmt: skip
-    part = {share: _shared.floats(values) for share, values in curves["residual"].items()}
-    residual.fill_between(nm, part["5"], part["95"], color="#1b6ca8", alpha=0.2, lw=0, label="90 %")
-    residual.fill_between(nm, part["25"], part["75"], color="#1b6ca8", alpha=0.35, lw=0,
-                          label="50 %")  # fmt: skip
-    residual.plot(nm, part["50"], color="#1b6ca8", label="median")
+    nm = np.array(result["curves"]["wavelength_nm"])
+    measured = _shared.floats(result["curves"]["measured_median"])
+    spectrum.plot(nm, measured, color="black", label="measured")
     residual.axhline(0, color="black", lw=0.8)
-    residual.legend(ncols=3, fontsize=8)
+    both = (("published model", "#c8553d", result), ("with more free", "#1b6ca8", result["beyond"]))
+    for number, (label, colour, part) in enumerate(both):
+        curves = part["curves"]
+        fitted = _shared.floats(curves["fitted_median"])
+        spectrum.plot(nm, fitted, color=colour, ls="--", label=label)
+        share = {name: _shared.floats(values) for name, values in curves["residual"].items()}
+        residual.fill_between(nm, share["5"], share["95"], color=colour, alpha=0.25, lw=0)
+        residual.plot(nm, share["50"], color=colour, label=f"{label}: median and 90 %")
+        rms = _shared.floats(row["residual_rms"] for row in part["row"])
+        rms = rms[np.isfinite(rms)]
+        middle = part["residual_rms"]["all"]["median"]
+        if rms.size:
+            histogram.hist(rms, bins=25, color=colour, alpha=0.7, label=f"median {middle:.4f}")
+        names = [name for name, found in part["residual_rms"].items() if found["n"]]
+        found = [part["residual_rms"][name] for name in names]
+        middle = np.array([one["median"] for one in found])
+        spread = [middle - [one["q05"] for one in found], [one["q95"] for one in found] - middle]
+        place = np.arange(len(names)) + 0.2 * number
+        bands.errorbar(middle, place, xerr=spread, fmt="o", color=colour, capsize=3)
+        bands.set_yticks(np.arange(len(names)), names)
+    spectrum.legend()
+    residual.legend(fontsize=8)
+    histogram.legend(fontsize=8)
+    title = f"{result['rows']} spectra of {result['file']}"
+    _shared.tidy(spectrum, "", "reflectance, median of spectra", title)
     _shared.tidy(residual, "wavelength (nm)", "measured - fitted (reflectance)")
-    rms = _shared.floats(row["residual_rms"] for row in result["row"])
-    rms = rms[np.isfinite(rms)]
-    histogram.hist(rms, bins=25, color="#1b6ca8")
-    _shared.tidy(
-        histogram, "residual RMS (reflectance)", "spectra",
-        f"median {result['residual_rms']['all']['median']:.4f}" if rms.size else "none fitted",
-    )  # fmt: skip
-    names = [name for name, found in result["residual_rms"].items() if found["n"]]
-    found = [result["residual_rms"][name] for name in names]
-    middle = np.array([one["median"] for one in found])
-    spread = [middle - [one["q05"] for one in found], [one["q95"] for one in found] - middle]
-    bands.errorbar(middle, np.arange(len(names)), xerr=spread, fmt="o", color="#1b6ca8", capsize=3)
-    bands.set_yticks(np.arange(len(names)), names)
+    _shared.tidy(histogram, "residual RMS (reflectance)", "spectra")
     bands.set_xlim(left=0)
     bands.invert_yaxis()
     _shared.tidy(bands, "residual RMS, median and 90 %", "range (nm)")

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import _shared
-from hylios_fit import adding, fresnel, melanosome, skin, streams, table
+from hylios_fit import adding, fresnel, skin, streams, table
 from hylios_fit.simulation import simulate
 from hylios_fit.skin import SPECS, Layers, Specimen
 from hylios_fit.surrogate import FLOOR, features, load_surrogate
@@ -99,23 +99,12 @@ def specimens(regime: str, seed: int) -> tuple[Specimen, ...]:
 @lru_cache
 def _coefficients(form: str, nm: tuple[float, ...]) -> Callable[[Any], Layers]:
     """Rows of all parameters -> layers side by side, as `adding` takes them, compiled."""
-    melanosome.accepted_share(form, 1.0, jnp.float32(0.1), jnp.float32(0.003))  # before tracing
 
     def one(row):
         values = dict(zip(SPECS, row, strict=True))
         return skin.let_stand(skin.layers(values, form, np.array(nm)), values, form)
 
-    def wide(a):  # (n, ..., w) -> (..., n w)
-        return jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1)
-
-    def every(rows):
-        medium = jax.vmap(one)(rows)
-        found = {name: wide(getattr(medium, name)) for name in table.SPECTRAL}
-        found["thickness"] = jnp.repeat(medium.thickness.T, len(nm), axis=1)
-        found["bottom"] = jnp.repeat(medium.bottom, len(nm))
-        return Layers(**found, roughness=medium.roughness[0])
-
-    return jax.jit(every)
+    return jax.jit(lambda rows: skin.side_by_side(jax.vmap(one)(rows)))
 
 
 def layers_of(given: tuple[Specimen, ...], nm: np.ndarray) -> Layers:
@@ -215,11 +204,16 @@ class Regression:
         mine = data["form"].values == number
         self.names = tuple(str(name) for name in data["parameter"].values)
         self.nm = data["wavelength_nm"].values
-        self.surface = float(data.attrs["surface"])
-        x = self._features(data["design"].values[mine])
+        self.form = form
+        rows = data["design"].values[mine]
+        x = self._features(rows)
         self.centre, self.scale = x.mean(axis=0), x.std(axis=0)
         x = (x - self.centre) / self.scale
-        y = data["reflectance"].values[mine].astype(float)
+        # the table's surfaces are of many indices, those that are asked for of one
+        given, own = (table.surface_share(r)[:, None] for r in (rows, self._usual()))
+        share = (data["reflectance"].values[mine] - given) / (1.0 - given)
+        self.surface = own
+        y = own + (1.0 - own) * share
         self.kind = kind
         if kind in ("nearest", "local"):
             from scipy.spatial import KDTree
@@ -229,7 +223,10 @@ class Regression:
             self._fit(x, y, seed)
 
     def _features(self, rows: np.ndarray) -> np.ndarray:
-        return np.asarray(features(self.names, jnp.asarray(rows, jnp.float32)), float)
+        return np.asarray(features(self.names, self.form, jnp.asarray(rows, jnp.float32)), float)
+
+    def _usual(self) -> np.ndarray:
+        return Specimen().parameters(self.names)[None]
 
     def _fit(self, x: np.ndarray, y: np.ndarray, seed: int) -> None:
         from sklearn.decomposition import PCA
@@ -285,7 +282,6 @@ REGRESSIONS = {
     "nearest": "nearest row of the table",
     "local": f"linear in the {NEAREST} nearest rows",
     "polynomial 2": "polynomial ridge, degree 2",
-    "polynomial 3": "polynomial ridge, degree 3",
     "kernel": "kernel ridge, 1536 rows",
     "perceptron": "one perceptron, 64 x 64",
 }

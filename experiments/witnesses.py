@@ -16,7 +16,7 @@ from experiments import _shared
 from hylios_fit import adding, skin, tally, walker
 from hylios_fit.simulation import ABSORB
 from hylios_fit.skin import Specimen
-from hylios_fit.table import DESIGN
+from hylios_fit.table import spread
 
 SPECIMENS = 200
 WAVELENGTHS = 6  # of each, over the whole range
@@ -33,13 +33,9 @@ def specimen_of(number: int, seed: int) -> tuple[Specimen, np.ndarray]:
         return Specimen.preset(name), np.linspace(260.0, 2400.0, 2 * WAVELENGTHS)
     g = np.random.default_rng([seed, number])
     values = {}
-    for axis in DESIGN:
-        u = g.uniform()
-        if axis.spread == "log":
-            values[axis.name] = axis.lower * (axis.upper / axis.lower) ** u
-        else:
-            power = {"linear": 1, "square": 2, "cube": 3}[axis.spread]
-            values[axis.name] = axis.lower + (axis.upper - axis.lower) * u**power
+    for axis in _shared.PIGMENTS:
+        u = np.array(g.uniform())
+        values[axis.name] = float(spread(u, axis.lower, axis.upper, axis.spread))
     for name in skin.LAYERS:
         values[f"thickness_{name}"] = skin.SPECS[f"thickness_{name}"].default * 2 ** g.uniform(
             -1, 1

@@ -163,7 +163,9 @@ def _parser() -> argparse.ArgumentParser:
         help="whether the surface's reflection is part of the measurement; default: included",
     )
     fit.add_argument(
-        "--free", metavar="NAME,...", help="parameters to estimate; default: all that there are"
+        "--free",
+        metavar="NAME,...",
+        help="parameters to estimate; `usual`, the default, is pigments, blood, water and lipids",
     )
     fit.add_argument(
         "--fix", action="append", default=[], metavar="NAME=VALUE", help="hold one; repeatable"

@@ -84,7 +84,8 @@ def fit(
         surrogate: the embedded one, if None.
         noise: standard deviation of the reflectance: a number, one for each band (B,), or its
             covariance (B, B). None: what came with the spectra, else the instrument's model.
-        free: names of the parameters that vary; the others stay at the prior's median.
+        free: names of the parameters that vary, and `usual` for pigments, blood, water and lipids
+            (the default); see `statevector.state_vector` for where the others stay.
         fix: values of parameters that are known; `melanosome_form` may be one of them.
         specular: whether the surface's reflection is in the measurement ("included") or not.
         wavelength_range: shortest and longest wavelength to use, nm.

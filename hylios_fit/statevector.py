@@ -48,6 +48,7 @@ class Prior:
 
 _TABLE_I = "Table I of Chen et al. 2015 (S1 to S4), after Kollias 1991 and Hennessy 2005"
 
+_INDEX = "1.36 to 1.43 in vivo (Ding 2006); the measured near infrared asks for up to 1.55"
 _CELLS = "Whitton and Everall 1973; Sandby-Moller 2003"
 
 #: The declared order is that of the surrogate; the names and priors are these. Together the
@@ -93,14 +94,14 @@ PRIORS: Mapping[str, Prior] = {
     "thickness_papillary": Prior(0.018, 0.3, 0.0, source="Meglinski 2002", usual=False),
     "thickness_reticular": Prior(0.13, 0.35, 0.0, source="Laurent 2007", usual=False),
     "index_corneum": Prior(1.53, 0.02, source="Tearney 1995; Ding 2006", usual=False),
-    "index_epidermis": Prior(1.42, 0.03, source="Ding 2006", usual=False),
-    "index_papillary": Prior(1.41, 0.03, source="Ding 2006", usual=False),
-    "index_reticular": Prior(1.42, 0.03, source="Ding 2006", usual=False),
+    "index_epidermis": Prior(1.43, 0.05, source=_INDEX, usual=False),
+    "index_papillary": Prior(1.43, 0.05, source=_INDEX, usual=False),
+    "index_reticular": Prior(1.43, 0.05, source=_INDEX, usual=False),
     "fibre_fraction": Prior(0.24, 0.06, source="0.22 in the paper", usual=False),
     "reticular_scattering": Prior(12.0, 0.7, 2.0, source="Jacques 2013", usual=False),
     "reticular_scattering_power": Prior(1.3, 0.35, source="Jacques 2013", usual=False),
     "bottom_reflectance": Prior(0.6, 0.18, source="0.5 to 0.9 on measured skin", usual=False),
-    "index_dispersion": Prior(0.01, 0.005, source="Ding 2006", usual=False),
+    "index_dispersion": Prior(0.012, 0.009, source=_INDEX, usual=False),
 }
 
 #: Conditioning on a held value at the very edge of the box would put its variable at infinity.
@@ -234,10 +235,10 @@ def state_vector(
 ) -> StateVector:
     """The state vector for a surrogate's parameters and box.
 
-    `names` (P), `lower` and `upper` (P,): the surrogate's. `free`: which vary (if None all that
-    are not fixed, of those that their prior calls usual); the others stay at the median of their
-    prior, those that are not usual at the model's own value. `fix`: values that are known;
-    the prior of the free ones is conditioned on them.
+    `names` (P), `lower` and `upper` (P,): the surrogate's. `free`: which vary; the word `usual`
+    among them, or None, stands for all that their prior calls usual and are not fixed. The others
+    stay at the median of their prior, those that are not usual at the model's own value. `fix`:
+    values that are known; the prior of the free ones is conditioned on them.
 
     Raises `HyliosError` for an unknown name, a value outside the box, a name both free and fixed,
     nothing left free, or a parameter that has no declared prior.
@@ -245,8 +246,9 @@ def state_vector(
     names = tuple(names)
     lower, upper = (np.asarray(edge, dtype=np.float64) for edge in (lower, upper))
     fix = dict(fix or {})
+    free = _spelt_out(("usual",) if free is None else free, names, fix)
     known = ", ".join(names)
-    for name in (*([] if free is None else (free := tuple(free))), *fix):
+    for name in (*free, *fix):
         if name not in names:
             raise HyliosError(f"unknown parameter {name!r}; the surrogate knows: {known}")
     undeclared = [name for name in names if name not in PRIORS]
@@ -254,7 +256,7 @@ def state_vector(
         raise HyliosError(
             f"no prior is declared for {', '.join(undeclared)}: add it to statevector.PRIORS"
         )
-    both = set(free or ()) & set(fix)
+    both = set(free) & set(fix)
     if both:
         raise HyliosError(f"both free and fixed: {', '.join(sorted(both))}")
     for name, value in fix.items():
@@ -263,8 +265,7 @@ def state_vector(
             raise HyliosError(
                 f"{name} = {value} is outside the surrogate's range {low:g} to {high:g}"
             )
-    free = [n for n in names if PRIORS[n].usual] if free is None else free
-    chosen = tuple(n for n in names if n not in fix and n in free)
+    chosen = tuple(n for n in names if n in free)
     if not chosen:
         raise HyliosError(f"nothing is free: leave at least one of {known}")
 
@@ -308,6 +309,16 @@ def state_vector(
         vector,
         (gain @ known_u, np.linalg.cholesky(covariance), held),
     )
+
+
+def _spelt_out(
+    free: Iterable[str], names: tuple[str, ...], fix: Mapping[str, float]
+) -> tuple[str, ...]:
+    usual = [n for n in names if n in PRIORS and PRIORS[n].usual and n not in fix]
+    asked = list(free)
+    if "usual" in asked:
+        asked = [n for n in asked if n != "usual"] + usual
+    return tuple(dict.fromkeys(asked))
 
 
 def derived(

@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 
 from hylios_fit import datasets, melanosome, skin
 from hylios_fit.errors import HyliosError
-from hylios_fit.skin import LAYERS, STRATA, Specimen
+from hylios_fit.skin import LAYERS, SPECS, STRATA, Specimen
 
 FORMAT = "hylios_fit surrogate"
 FORMAT_VERSION = 3
@@ -101,7 +101,7 @@ class Member(eqx.Module):
     scale: Float[Array, "f"]
     weights: tuple[Float[Array, "i o"], ...]
     biases: tuple[Float[Array, "o"], ...]
-    components: Float[Array, "k c"]
+    components: Float[Array, "k c"] | None  # None: of few bands, part of the last weights
     mean: Float[Array, "c"]
     fresnel: Float[Array, "q"]  # what the surface reflects, a polynomial of the index above 1.5
     dispersion: Float[Array, "b"]  # what `index_dispersion` is multiplied by
@@ -132,7 +132,9 @@ class Member(eqx.Module):
             x = jnp.matmul(x, w, precision=PRECISION) + b.reshape(like)
             if i < len(self.weights) - 1:
                 x = jnp.tanh(x)
-        log = jnp.matmul(x, self.components, precision=PRECISION) + self.mean.reshape(like)
+        if self.components is not None:
+            x = jnp.matmul(x, self.components, precision=PRECISION)
+        log = x + self.mean.reshape(like)
         bands = jnp.exp(log) - FLOOR
         if self.readout is not None:
             bands = jnp.matmul(bands, self.readout, precision=PRECISION)
@@ -234,13 +236,22 @@ class Member(eqx.Module):
         used = np.flatnonzero(w.any(axis=0))
         readout = w[:, used].T
         dtype = self.mean.dtype
+        assert self.components is not None
+        components, weights_, biases = self.components[:, used], self.weights, self.biases
+        wide, kept = weights_[-1].shape
+        if wide * used.size <= (wide + used.size) * kept:  # one product is less work than two
+            weights_ = (*weights_[:-1], _product(weights_[-1], components))
+            biases = (*biases[:-1], _product(biases[-1], components))
+            components = None
         # errors of the logarithm add up by what it was taken of
         share = w * np.exp(np.asarray(self.mean, float))
         share = (share / share.sum(axis=1, keepdims=True)).T
         return dataclasses.replace(
             self,
             projected=True,
-            components=self.components[:, used],
+            weights=weights_,
+            biases=biases,
+            components=components,
             mean=self.mean[used],
             dispersion=jnp.asarray(w @ np.asarray(self.dispersion, float), dtype),
             wavelength_nm=w @ grid if wavelength_nm is None else np.asarray(wavelength_nm, float),
@@ -346,6 +357,11 @@ class Surrogate(eqx.Module):
     def of(self, specimen: Specimen, wavelength_nm: Any) -> np.ndarray:
         """Reflectance of a specimen at wavelengths, with a check that the surrogate knows it."""
         usual = Specimen().values
+        # fibres act by their number and their radius cubed (Eq. 7), of which the first is known
+        thicker = (specimen.fibre_radius / usual["fibre_radius"]) ** 3
+        if thicker != 1.0 and "fibre_fraction" in self.names:
+            fraction = min(specimen.fibre_fraction * thicker, SPECS["fibre_fraction"].upper)
+            specimen = specimen.replace(fibre_fraction=fraction, fibre_radius=usual["fibre_radius"])
         unknown = [
             f"{name} = {value:g} (it knows {usual[name]:g})"
             for name, value in specimen.values.items()
@@ -362,6 +378,10 @@ class Surrogate(eqx.Module):
         weights = _linear(np.asarray(member.wavelength_nm), bands)
         # the whole spectrum, because that is compiled once for all bands
         return weights @ np.asarray(member(jnp.asarray(parameters[:-1], jnp.float32)), float)
+
+
+def _product(a: Array, b: Array) -> Array:
+    return jnp.asarray(np.asarray(a, float) @ np.asarray(b, float), a.dtype)
 
 
 def _linear(grid: np.ndarray, at: np.ndarray) -> np.ndarray:

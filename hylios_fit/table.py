@@ -251,11 +251,11 @@ def solve_rows(
     return reflectance
 
 
-def surface_share(parameters: np.ndarray) -> np.ndarray:
+def surface_share(parameters: np.ndarray, names: tuple[str, ...] = NAMES) -> np.ndarray:
     """What the surface reflects at once at the table's angle of incidence, (rows,)."""
     angle = float(np.radians(INCIDENCE_DEG))
     curve = fresnel.surface_curve(angle, Specimen().roughness)
-    return curve(parameters[:, NAMES.index("index_corneum")])
+    return curve(parameters[:, names.index("index_corneum")])
 
 
 # --- storing ----------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ axis for them (`index_dispersion`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
@@ -22,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hylios_fit import fresnel
-from hylios_fit.skin import Layers, Specimen
+from hylios_fit.skin import LAYERS, Layers, Specimen
 from hylios_fit.statevector import PRIORS, derived, state_vector
 from hylios_fit.surrogate import (
     FLOOR,
@@ -33,21 +34,22 @@ from hylios_fit.surrogate import (
     load_surrogate,
     save,
 )
-from hylios_fit.table import SHARE, layers_of, read_table, solve_rows, spread
+from hylios_fit.table import layers_of, read_table, solve_rows, spread, surface_share
 
 FURTHER = {"index_dispersion": (-0.005, 0.035)}
 """Ranges of parameters that the table has no axis for and its indices cover."""
-LOCAL_HIDDEN = (128, 128, 64)
-LOCAL_STEPS = 120_000
-LOCAL_BATCH = 2048
-SPECIMENS = 131_072  # of each form, that the local regression answers for
-COMPONENTS = 48
-HIDDEN = (160, 160)
-STEPS = 200_000
-BATCH = 256
+LOCAL_HIDDEN = (128, 128, 128)
+LOCAL_STEPS = 600_000
+LOCAL_BATCH = 256
+SPECIMENS = 163_840  # of each form, that the local regression answers for
+COMPONENTS = 80
+HIDDEN = (192, 192)
+STEPS = 500_000
+BATCH = 128
 RATES = tuple((3e-3 * 0.5**k, 1 / 9) for k in range(9))  # and the share of the steps
 LEAST_ROWS = 64  # of each form
 CHECK_ORDER = 8  # of the solver that they are held against
+TOGETHER = 16  # of them have the same refractive indices
 CHECKS = 256  # fresh specimens of each form that measure the error
 MODES = 32
 REGIONS = 12  # of the box, that `check` names
@@ -88,7 +90,7 @@ def train(
         "upper": np.array([high for _, high in box.values()]),
         "fresnel": curve.convert(domain=(0.5, 2.5)).coef,
     }
-    for form, fitted in _fits(table, box, forms, curve, seed, progress).items():
+    for form, fitted in _fits(table, box, forms, seed, progress).items():
         parts = {**fitted, "modes": np.zeros((1, nm.size)), "rest": np.zeros(nm.size)}
         arrays.update({f"{form}/{name}": a.astype(np.float32) for name, a in parts.items()})
 
@@ -122,13 +124,13 @@ def train(
 
 
 def fresh(member: Any, count: int, key: Array) -> np.ndarray:
-    """(count, P) specimens from the prior with every parameter free; `SHARE` in turn have the same
-    refractive indices, so that they can be solved together."""
+    """(count, P) specimens from the prior with every parameter free; `TOGETHER` in turn have the
+    same refractive indices, so that they can be solved together."""
     names = member.names
     vector = state_vector(names, member.lower, member.upper, free=names)
     drawn = vector.prior_draws(key, count)
     alike = [i for i, name in enumerate(names) if name.startswith("index_")]
-    first = np.arange(count) // SHARE * SHARE
+    first = np.arange(count) // TOGETHER * TOGETHER
     drawn[:, alike] = drawn[first][:, alike]
     return drawn
 
@@ -151,7 +153,7 @@ def _check(
     ):
         for form in surrogate.forms:
             member = surrogate.at(form)
-            lots = [drawn[i : i + SHARE] for i in range(0, checks, SHARE)]
+            lots = [drawn[i : i + TOGETHER] for i in range(0, checks, TOGETHER)]
             truth = []
             for lot in pool.map(partial(solve, member.names, form), lots):
                 truth.append(lot)
@@ -193,43 +195,71 @@ def solve(names: tuple[str, ...], form: str, rows: np.ndarray) -> np.ndarray:
 
 
 def local_features(layers: Layers) -> Float[Array, "w f"]:
-    """What one wavelength knows of the layers: optical depths, hits, indices, and a rough guess.
-
-    The guess is that of Kubelka and Munk for the reticular dermis over its bottom, seen through
-    what lies above and from below the surface.
-    """
+    """What one wavelength knows of the layers: optical depths, hits, indices, and a rough guess."""
     depth = layers.thickness[:, None]
     absorbed = layers.mu_a * depth
     hits = layers.mu_particle[1:4] * depth[1:4]
     lost = 1.0 - layers.hit_albedo[1:4]
-    fibre = layers.mu_fibre * depth[4, 0]
+    fibre = layers.mu_fibre * depth[4]
     tissue = layers.mu_tissue[5] * depth[5]
-    bottom = layers.bottom * jnp.ones_like(fibre)
     index = layers.index[jnp.array([0, 1, 4, 5])]
     steps = jnp.sqrt((index[1:] - index[:-1]) ** 2 + 1e-5)
-
-    k, s = 2.0 * absorbed[5], 0.75 * tissue
-    x = jnp.sqrt(k * (k + 2.0 * s) + 1e-6)
-    fade = jnp.exp(-2.0 * x)
-    sinh, cosh = 0.5 * (1.0 - fade) / x, 0.5 * (1.0 + fade)  # over x exp(x), and over exp(x)
-    dermis = s * sinh * (1.0 - bottom) + bottom * (cosh - k * sinh)
-    dermis = jnp.clip(dermis / (cosh + (k + s * (1.0 - bottom)) * sinh), 0.0, 1.0)
-    back = 0.5 * (1.0 - jnp.exp(-1.5 * fibre))
-    through = (1.0 - back) * jnp.exp(-2.0 * absorbed[4])
-    dermis = back + through**2 * dermis / (1.0 - back * dermis)
     pigment = jnp.sum(absorbed[1:4] + hits * lost, axis=0)
-    above = jnp.exp(-4.0 * (absorbed[0] + pigment))
-    guess = above * dermis / (1.0 - 0.5 * above * dermis)
+    guess = _two_fluxes(layers)
     rows = [
         jnp.log(absorbed + 1e-3), jnp.sqrt(absorbed + 1e-4), jnp.log(hits + 0.05),
         jnp.log(lost + 1e-3), jnp.log(hits * lost + 1e-3), layers.theta_0[None],
         jnp.log(fibre + 0.02)[None], jnp.log(tissue + 0.1)[None], jnp.sqrt(tissue + 0.01)[None],
-        bottom[None], index, steps, jnp.log(pigment + 1e-3)[None],
-        jnp.log(pigment + absorbed[0] + 1e-3)[None],
-        jnp.log(absorbed[4] + absorbed[5] + 1e-3)[None],
-        dermis[None], guess[None], jnp.log(guess + 0.05)[None],
+        layers.bottom * jnp.ones_like(tissue)[None], index, steps,
+        jnp.log(pigment + 1e-3)[None], jnp.log(pigment + absorbed[0] + 1e-3)[None],
+        jnp.log(absorbed[4] + absorbed[5] + 1e-3)[None], guess, jnp.log(guess[-1:] + 0.05),
     ]  # fmt: skip
     return jnp.concatenate(rows).T
+
+
+def _two_fluxes(layers: Layers) -> Float[Array, "4 w"]:
+    """Light that two fluxes (Kubelka and Munk 1931) get back from reticular dermis, papillary
+    dermis and epidermis, each with all below, and out of the skin: right to some 10 %."""
+    depth = layers.thickness[:, None]
+    absorbed, hits = layers.mu_a * depth, layers.mu_particle * depth
+    survives = layers.hit_albedo
+    bend = 1.0 - jnp.exp(-3.0 * layers.theta_0**2)  # 1 - g of a hit
+    fibre = 0.5 * (1.0 - jnp.exp(-1.5 * layers.mu_fibre * depth[4]))
+    index = jnp.concatenate([jnp.ones_like(layers.index[:1]), layers.index])
+
+    def slab(k, s):
+        x = jnp.sqrt(k * (k + 2.0 * s) + 1e-6)
+        fade = jnp.exp(-2.0 * x)
+        sinh, cosh = 0.5 * (1.0 - fade) / x, 0.5 * (1.0 + fade)  # over x exp(x), over exp(x)
+        whole = cosh + (k + s) * sinh
+        return s * sinh / whole, jnp.exp(-x) / whole
+
+    def interface(above, below):
+        r = 1.5 * ((above - below) / (above + below)) ** 2
+        up = jnp.where(below > above, 1.0 - (above / below) ** 2 * (1.0 - r), r)
+        down = jnp.where(below > above, r, 1.0 - (below / above) ** 2 * (1.0 - r))
+        return up, down
+
+    light = layers.bottom * jnp.ones_like(bend)
+    found = []
+    for i in reversed(range(len(LAYERS))):
+        fade = jnp.exp(-2.0 * absorbed[i])
+        if i == 0:
+            r, t = 0.0, fade
+        elif i == 4:
+            r, t = fibre * fade, (1.0 - fibre) * fade
+        elif i == 5:
+            r, t = slab(2.0 * absorbed[i], 0.75 * layers.mu_tissue[i] * depth[i])
+        else:
+            lost = absorbed[i] + hits[i] * (1.0 - survives[i])
+            r, t = slab(2.0 * lost, 0.75 * hits[i] * survives[i] * bend)
+        light = r + t**2 * light / (1.0 - r * light)
+        if i in (1, 4, 5):
+            found.append(light)
+        up, down = interface(index[i], index[i + 1])
+        out = (1.0 - up) * light / (1.0 - up * light)
+        light = down + (1.0 - down) * out if i else out  # from outside, all has entered
+    return jnp.stack([*found, light])
 
 
 @lru_cache(maxsize=8)
@@ -238,21 +268,37 @@ def _inputs(names: tuple[str, ...], form: str) -> Callable[[Array], Float[Array,
     return jax.jit(lambda rows: jax.vmap(local_features)(of(rows)))
 
 
-def _learn_locally(
-    x: np.ndarray, log: np.ndarray, noise: np.ndarray, seed: int, bar: Any
-) -> Callable[[Array], Array]:
-    """From local features (n, w, f), what they give (n, w) and its variance: features -> that."""
+def learn_locally(
+    table: Any, form: str, seed: int = 0, bar: Any = None, steps: int | None = None
+) -> Callable[[tuple[str, ...], np.ndarray], np.ndarray]:
+    """The local regression of a table's rows (`read_table`) of one form.
+
+    What it returns takes names (P) and parameters (n, P), and gives the logarithm (n, w) of the
+    light from inside, plus `FLOOR`, as a share of what entered. `bar` counts the stages; `steps`
+    of the optimiser, `LOCAL_STEPS` if None.
+    """
+    forms = str(table["form"].attrs["flag_meanings"]).split()
+    mine = table["form"].values == forms.index(form)
+    axes = tuple(str(name) for name in table["parameter"].values)
+    rows = table["design"].values[mine]
+    at = surface_share(rows, axes)[:, None]
+    share = np.clip((table["reflectance"].values[mine] - at) / (1.0 - at), 0.0, None) + FLOOR
+    noise = (table["standard_error"].values[mine] / (1.0 - at) / share) ** 2
+    log = np.log(share)
+    x = np.concatenate([np.asarray(_inputs(axes, form)(lot)) for lot in _lots(rows)])
     x = x.reshape(-1, x.shape[-1])
     centre, scale = x.mean(axis=0), x.std(axis=0) + 1e-6
     middle, unit = float(log.mean()), float(log.std())
     y = ((log - middle) / unit).astype(np.float32).reshape(-1)
     variance = float(noise.mean()) / unit**2
-    network = _network(
-        (x - centre) / scale, y, LOCAL_HIDDEN, LOCAL_STEPS, LOCAL_BATCH, variance, seed, bar
-    )
+    x -= centre
+    x /= scale
+    steps = steps or LOCAL_STEPS
+    network = _network(x, y, LOCAL_HIDDEN, steps, LOCAL_BATCH, variance, seed, bar)
     weights = [jnp.asarray(w, jnp.float32) for w in network.coefs_]
     biases = [jnp.asarray(b, jnp.float32) for b in network.intercepts_]
 
+    @jax.jit
     def answer(x: Array) -> Array:
         x = (x - centre) / scale
         for i, (w, b) in enumerate(zip(weights, biases, strict=True)):
@@ -261,7 +307,11 @@ def _learn_locally(
                 x = jnp.tanh(x)
         return x[..., 0] * unit + middle
 
-    return jax.jit(answer)
+    def every(names: tuple[str, ...], rows: np.ndarray) -> np.ndarray:
+        of = _inputs(names, form)
+        return np.concatenate([np.asarray(answer(of(lot))) for lot in _lots(rows)])
+
+    return every
 
 
 def _lots(rows: np.ndarray, size: int = 64) -> list[Array]:
@@ -273,7 +323,7 @@ def _lots(rows: np.ndarray, size: int = 64) -> list[Array]:
 
 
 def _fits(
-    table: Any, box: dict[str, tuple[float, float]], forms: tuple[str, ...], curve: Any, seed: int,
+    table: Any, box: dict[str, tuple[float, float]], forms: tuple[str, ...], seed: int,
     progress: bool,
 ) -> dict[str, dict[str, np.ndarray]]:  # fmt: skip
     """By form: every number of the fitted pipeline by name."""
@@ -284,10 +334,8 @@ def _fits(
     from threadpoolctl import threadpool_limits
     from tqdm import tqdm
 
-    axes = tuple(str(name) for name in table["parameter"].values)
-    rows = table["design"].values
-    specimens = _specimens(box, dict(zip(axes, table["spread"].values, strict=True)), seed)
-    surface = curve(rows[:, axes.index("index_corneum"), None])
+    spreads = dict(zip(table["parameter"].values, table["spread"].values, strict=True))
+    specimens = _specimens(box, spreads, seed)
     with (
         tqdm(
             total=2 * len(forms) * len(RATES), desc="train", unit="stage", disable=not progress
@@ -298,32 +346,23 @@ def _fits(
     ):
         warnings.simplefilter("ignore", ConvergenceWarning)  # the epochs are fixed beforehand
 
-        def one(number: int) -> dict[str, np.ndarray]:
-            mine, form = table["form"].values == number, forms[number]
-            at = surface[mine]
-            share = (table["reflectance"].values[mine] - at) / (1.0 - at)
-            share = np.clip(share, 0.0, None) + FLOOR
-            noise = (table["standard_error"].values[mine] / (1.0 - at) / share) ** 2
-            known = _inputs(axes, form)
-            x = np.concatenate([np.asarray(known(lot)) for lot in _lots(rows[mine])])
-            answer = _learn_locally(x, np.log(share), noise, seed, bar)
-            del x
-            more = _inputs(tuple(box), form)
-            log = np.concatenate([np.asarray(answer(more(lot))) for lot in _lots(specimens)])
+        def one(form: str) -> dict[str, np.ndarray]:
+            log = learn_locally(table, form, seed, bar)(tuple(box), specimens)
             x = features(tuple(box), form, jnp.asarray(specimens, jnp.float32))
             return _fit(np.asarray(x, float), log, seed, bar)
 
-        return dict(zip(forms, pool.map(one, range(len(forms))), strict=True))
+        return dict(zip(forms, pool.map(one, forms), strict=True))
 
 
 def _specimens(
     box: dict[str, tuple[float, float]], spreads: dict[str, str], seed: int
 ) -> np.ndarray:
-    """(SPECIMENS, P): half spread over the box as the table is, half drawn from the prior."""
+    """(SPECIMENS, P): a quarter spread over the box as the table is, the rest from the prior."""
     from scipy.stats import qmc
 
-    half = SPECIMENS // 2
-    unit = qmc.Sobol(len(box), rng=np.random.default_rng([seed, 2])).random(half)
+    part = SPECIMENS // 4
+    sobol = qmc.Sobol(len(box), rng=np.random.default_rng([seed, 2]))
+    unit = sobol.random(1 << math.ceil(math.log2(part)))[:part]
     over = [
         spread(u, low, high, spreads.get(name, "linear"))
         for u, (name, (low, high)) in zip(unit.T, box.items(), strict=True)
@@ -331,7 +370,7 @@ def _specimens(
     vector = state_vector(
         tuple(box), [low for low, _ in box.values()], [high for _, high in box.values()], tuple(box)
     )
-    drawn = vector.prior_draws(jax.random.fold_in(jax.random.key(seed), 2), SPECIMENS - half)
+    drawn = vector.prior_draws(jax.random.fold_in(jax.random.key(seed), 2), SPECIMENS - part)
     return np.concatenate([np.stack(over, axis=1), drawn])
 
 
@@ -356,7 +395,8 @@ def _network(
         epochs = max(round(share * steps * lot / len(x)), 1)
         network.set_params(learning_rate_init=rate, max_iter=epochs)
         network.fit(x, y)
-        bar.update()
+        if bar is not None:
+            bar.update()
     return network
 
 

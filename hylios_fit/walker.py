@@ -630,6 +630,8 @@ class Plan(NamedTuple):
 COLUMNS = (4, 1, 1, 1, 2, 2, 2, 2, 2, 8)  # of each node of `NODES`
 LEAST_SHARE = 0.01  # of the rays, for every column that serves anything
 BETWEEN = 0.2  # for `absorb` where theta_0 falls: little is absorbed there, and rays are few
+FEW = 0.004  # hits in a straight pass of a stratum without melanosomes
+NOTHING = 1e-12
 REACH = 0.6  # how far, in the logarithm of a scattering coefficient, paths serve others well
 
 
@@ -680,9 +682,12 @@ def plan(layers: Layers, absorb: float = 0.4) -> Plan:
             albedo.append(wide.hit_albedo[:, near].max(axis=1) ** part)
         shares += [total[-1] / count] * count
     at = np.array(chosen)
+    # where there are no melanosomes a few are met, or no path would know what the first one does
+    few = np.zeros((len(LAYERS), 1))
+    few[1:4, 0] = FEW / wide.thickness[1:4]
     columns = wide._replace(
         index=wide.index[:, at],
-        mu_particle=wide.mu_particle[:, at],
+        mu_particle=np.maximum(wide.mu_particle[:, at], few),
         mu_fibre=wide.mu_fibre[at],
         mu_tissue=wide.mu_tissue[:, at],
         mu_a=np.stack(mu_a, axis=1),
@@ -714,10 +719,9 @@ def log_density(layers: Layers, absorb: float = 1.0) -> Float[Array, "16 w"]:
     What does not depend on the wavelength or the contents (directions, facets, positions of
     particles) is left out: only ratios of densities count. The chance of a node is `node_shares`.
     """
-    tiny = 1e-30
 
-    def log(x):
-        return jnp.log(jnp.maximum(x, tiny))
+    def log(x):  # the derivative of x^n at 0 stays what it is: 1 for a single hit
+        return jnp.log(x + NOTHING)
 
     k = layers.mu_a.shape[1]
     particle = layers.mu_particle[1:4]

@@ -178,3 +178,31 @@ def test_a_state_at_the_edge_is_refused():
     parameters[9] = 1.3
     with pytest.raises(HyliosError, match="not inside the surrogate's range: water"):
         VECTOR.state(parameters)
+
+
+def test_usual_stands_for_what_is_free_unless_said_otherwise():
+    from hylios_fit import table
+    from hylios_fit.skin import SPECS
+
+    names = table.NAMES
+    edges = [axis.lower for axis in table.DESIGN], [axis.upper for axis in table.DESIGN]
+    usual = statevector.state_vector(names, *edges)
+    assert usual.free == tuple(n for n in names if statevector.PRIORS[n].usual) == tuple(NAMES)
+    more = statevector.state_vector(
+        names, *edges, free=["usual", "bottom_reflectance"], fix={"water": 1.0}
+    )
+    assert set(more.free) == set(usual.free) - {"water"} | {"bottom_reflectance"}
+    held = dict(zip(names, usual.held, strict=True))
+    for name in names:
+        if not statevector.PRIORS[name].usual:
+            assert held[name] == pytest.approx(SPECS[name].default)
+        else:
+            assert held[name] == statevector.PRIORS[name].median
+
+
+def test_quantities_are_means_by_the_thickness_that_was_asked_for():
+    names = (*NAMES, "thickness_papillary", "thickness_reticular")
+    p = dict.fromkeys(names, 1.0) | {"blood_papillary": 3.0, "blood_reticular": 1.0}
+    p |= {"thickness_papillary": 0.1, "thickness_reticular": 0.1}
+    found = statevector.derived(names, np.array(list(p.values())))
+    assert found["blood_percent"] == pytest.approx(2.0)

@@ -1,0 +1,137 @@
+"""How far the embedded surrogate is from the solver: reflectance, colour and slopes."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+from experiments import _shared
+from hylios_fit import adding, training
+from hylios_fit.appearance import appearances, colour_differences
+from hylios_fit.skin import Specimen
+from hylios_fit.statevector import PRIORS, state_vector
+from hylios_fit.surrogate import Surrogate, load_surrogate
+
+EACH = 256  # specimens of each form and kind
+SLOPES = 24  # of each form whose derivatives are compared
+GOALS = {"rms": 5e-4, "most": 3e-3, "ciede2000_q99": 0.1, "slopes": 0.01}
+
+
+def run(
+    seed: int = 0,
+    each: int = EACH,
+    slopes: int = SLOPES,
+    surrogate: Surrogate | None = None,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Fresh specimens from the prior, with the pigments, blood, water and lipids free and the rest
+    at the model's values, as in a usual fit; and with every parameter free."""
+    surrogate = surrogate or load_surrogate()
+    nm = surrogate.wavelength_nm
+    found: dict[str, Any] = {
+        "surrogate": _shared.surrogate_record(surrogate),
+        "order": training.CHECK_ORDER,
+        "goals": GOALS,
+        "wavelength_nm": nm.tolist(),
+        "kinds": {},
+    }
+    for number, kind in enumerate(("usual", "every")):
+        parts = {}
+        for form in surrogate.forms:
+            member = surrogate.at(form)
+            key = jax.random.fold_in(jax.random.key(seed), 100 + number)
+            if kind == "usual":
+                vector = state_vector(member.names, member.lower, member.upper)
+                rows = vector.prior_draws(key, each)
+            else:
+                rows = training.fresh(member, each, key)
+            truth = _solved(member.names, form, rows, progress)
+            parts[form] = np.asarray(member(rows.astype(np.float32)), float), truth
+        told = {form: _errors(nm, *pair) for form, pair in parts.items()}
+        every = [np.concatenate(part) for part in zip(*parts.values(), strict=True)]
+        found["kinds"][kind] = {"both": _errors(nm, *every), **told}
+    found["slopes"] = {form: _slopes(surrogate, form, slopes, seed) for form in surrogate.forms}
+    return found
+
+
+def _solved(names: tuple[str, ...], form: str, rows: np.ndarray, progress: bool) -> np.ndarray:
+    from tqdm import tqdm
+
+    lots = [rows[i : i + training.TOGETHER] for i in range(0, len(rows), training.TOGETHER)]
+    with ThreadPoolExecutor(training.THREADS) as pool:
+        solved = pool.map(partial(training.solve, names, form), lots)
+        bar = tqdm(solved, total=len(lots), desc=form, disable=not progress)
+        return np.concatenate(list(bar))
+
+
+def _errors(nm: np.ndarray, found: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
+    error = found - truth
+    use = (nm >= 380) & (nm <= 780)
+    pairs = [appearances(nm[use], np.clip(part[:, use], 0.0, 1.0)) for part in (found, truth)]
+    away = np.array(colour_differences(*pairs), float)
+    return {
+        "specimens": len(error),
+        "rms": _shared.significant(np.sqrt(np.mean(error**2))),
+        "within_3e-3": _shared.significant(np.mean(np.abs(error) <= GOALS["most"]), 6),
+        "q999": _shared.significant(np.quantile(np.abs(error), 0.999)),
+        "largest": _shared.significant(np.abs(error).max()),
+        "ciede2000": {
+            f"q{share}": _shared.significant(np.percentile(away, share)) for share in (50, 95, 99)
+        },
+        "rms_by_wavelength": _shared.significant(np.sqrt(np.mean(error**2, axis=0)), 3),
+        "q99_by_wavelength": _shared.significant(np.quantile(np.abs(error), 0.99, axis=0), 3),
+    }
+
+
+def _slopes(surrogate: Surrogate, form: str, count: int, seed: int) -> dict[str, Any]:
+    """RMS difference over RMS of the derivatives by each usual parameter, scaled by its range."""
+    member = surrogate.at(form)
+    names = tuple(name for name in member.names if PRIORS[name].usual)
+    vector = state_vector(member.names, member.lower, member.upper)
+    rows = vector.prior_draws(jax.random.fold_in(jax.random.key(seed), 200), count)
+    own = jax.jit(jax.vmap(jax.jacfwd(member._evaluate)))(rows.astype(np.float32))
+    place = [member.names.index(name) for name in names]
+    own = np.moveaxis(np.asarray(own, float)[..., place], -1, 1)
+    true = []
+    for row in rows:
+        specimen = Specimen(dict(zip(member.names, row.tolist(), strict=True)), form)
+        true.append(np.asarray(adding.slopes(specimen, member.wavelength_nm, names)[1], float))
+    true = np.array(true)
+    off = np.sqrt(np.mean((own - true) ** 2, axis=(0, 2)))
+    size = np.sqrt(np.mean(true**2, axis=(0, 2)))
+    return dict(zip(names, _shared.significant(off / size, 3), strict=True))
+
+
+def draw(result: dict[str, Any], path: Any) -> None:
+    """Error by wavelength, and relative error of the slopes."""
+    figure = _shared.figure(11, 4.8)
+    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
+    nm = np.array(result["wavelength_nm"])
+    labels = {"usual": "pigments, blood, water, lipids free", "every": "every parameter free"}
+    for (kind, told), colour in zip(result["kinds"].items(), _shared.COLOURS, strict=False):
+        both = told["both"]
+        label = f"{labels[kind]}: RMS {both['rms']:.1e}"
+        left.plot(nm, both["rms_by_wavelength"], color=colour, label=label)
+        left.plot(nm, both["q99_by_wavelength"], color=colour, ls=":", lw=1)
+    left.axhline(result["goals"]["rms"], color="black", ls="--", lw=0.8)
+    left.set_yscale("log")
+    left.legend(fontsize=8)
+    number = 2 * result["kinds"]["usual"]["complex"]["specimens"]
+    title = f"{number} fresh specimens each; dotted: 99 % lie below"
+    _shared.tidy(left, "wavelength (nm)", "error of the reflectance", title)
+    for (form, found), colour in zip(result["slopes"].items(), _shared.COLOURS[2:], strict=False):
+        right.barh(
+            np.arange(len(found)) + 0.4 * (form == "dispersed"), 100 * np.array([*found.values()]),
+            height=0.4, color=colour, label=form,
+        )  # fmt: skip
+    names = list(result["slopes"]["complex"])
+    right.set_yticks(np.arange(len(names)) + 0.2, names, fontsize=8)
+    right.axvline(100 * result["goals"]["slopes"], color="black", ls="--", lw=0.8)
+    right.legend(fontsize=8)
+    right.invert_yaxis()
+    _shared.tidy(right, "RMS error of the slope (%)", "")
+    _shared.save_figure(figure, path)
