@@ -33,7 +33,7 @@ from jaxtyping import Array, Float
 
 from hylios_fit import streams
 from hylios_fit.errors import HyliosError
-from hylios_fit.skin import Layers, Specimen, let_stand
+from hylios_fit.skin import LAYERS, Layers, Specimen, let_stand
 from hylios_fit.skin import layers as layers_of
 from hylios_fit.streams import SAME, Streams
 from hylios_fit.threads import one_blas_thread
@@ -442,8 +442,14 @@ def skin(
     return _run(c, kinds, index, 1.0, roughness, incidence, order, dtype, inner, parts)
 
 
-def _of_skin(layers: Layers, order: int, dtype: Any, parts: tuple[int, ...] = ()):
-    """(coefficients, kind of each layer, indices, roughness)."""
+def _of_skin(
+    layers: Layers, order: int, dtype: Any, parts: tuple[int, ...] = (), moving: Sequence[str] = ()
+):
+    """(coefficients, kind of each layer, indices, roughness).
+
+    A layer that scatters nothing is solved as clear, unless one of the parameters that are `moving`
+    would make it scatter.
+    """
     w = layers.mu_a.shape[1]
     index, roughness = (
         _concrete("the indices", layers.index),
@@ -451,11 +457,11 @@ def _of_skin(layers: Layers, order: int, dtype: Any, parts: tuple[int, ...] = ()
     )
     kinds = ["clear"] * 6
     for i in (1, 2, 3):
-        if _present(layers.mu_particle[i]):
+        if _present(layers.mu_particle[i]) or f"melanosome_{LAYERS[i]}" in moving:
             kinds[i] = "scatter"
-    if _present(layers.mu_fibre):
+    if _present(layers.mu_fibre) or {"fibre_fraction", "fibre_radius"} & {*moving}:
         kinds[4] = "fibres"
-    if _present(layers.mu_tissue[5]):
+    if _present(layers.mu_tissue[5]) or "reticular_scattering" in moving:
         kinds[5] = "scatter"
     theta_0 = _concrete("theta_0", layers.theta_0)
     angles, place = np.unique(theta_0, return_inverse=True)
@@ -537,7 +543,7 @@ def slopes(
         )
         parts, tangents = moving(values, x)
 
-        c, kinds, index, roughness = _of_skin(fixed._replace(**parts), order, dtype)
+        c, kinds, index, roughness = _of_skin(fixed._replace(**parts), order, dtype, moving=names)
         c, optics, which, counts, at = _ready(
             c, kinds, index, 1.0, roughness, incidence, order, dtype
         )

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from hylios_fit import adding, skin, streams, tally, tissue, walker
 from hylios_fit.errors import HyliosError
+from hylios_fit.simulation import simulate
 from hylios_fit.skin import Specimen
 from hylios_fit.tissue import Tissue
 
@@ -310,3 +311,15 @@ def test_tissue_solver_agrees_with_its_walk(x64):
         statistic += float(np.sum((walked.ends - expected) ** 2 / expected))
         freedom += m + 1
     assert chi2.sf(statistic, freedom) > 1e-3
+
+
+def test_the_slope_at_a_content_of_nothing_is_that_of_a_little_of_it(x64):
+    nm = np.array([400.0, 700.0, 1200.0])
+    names = ("melanosome_spinosum", "reticular_scattering", "fibre_fraction")
+    base = Specimen().replace(fibre_fraction=0.0)  # of all three it has nothing
+    _, slopes = adding.slopes(base, nm, names)
+    for name, slope in zip(names, np.asarray(slopes), strict=True):
+        step = 1e-4  # from there on, so that both are solved with the same streams
+        one, two = (simulate(base.replace(**{name: n * step}), nm, method="adding") for n in (1, 2))
+        change = (two.reflectance - one.reflectance) / step
+        np.testing.assert_allclose(slope, change, atol=0.01 * np.abs(slope).max())

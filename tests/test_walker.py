@@ -218,6 +218,38 @@ def test_the_sums_of_paths_are_possible(paths, layers):
     assert np.all(out[~deep, walker.BOTTOM] == 0)
 
 
+def test_slopes_are_those_of_the_solver_also_at_a_content_of_nothing():
+    from hylios_fit import adding
+
+    nm = np.array([400.0, 500.0, 650.0, 900.0])
+    names = ("melanosome_spinosum", "melanosome_basale", "blood_reticular")  # S3 has no first
+    layers = S3.layers(nm)
+    plan = walker.plan(layers)
+
+    def curve(x, paths):
+        asked = skin.layers({**S3.values, **dict(zip(names, x, strict=True))}, "complex", nm)
+        return tally.collect(paths, plan.layers, asked, shares=plan.shares).mean
+
+    slope = jax.jit(jax.jacfwd(curve))
+    x = jnp.asarray(S3.parameters(names), jnp.float32)
+    found = []
+    for i in range(8):
+        paths = walker.walk(
+            plan.layers, "complex", jax.random.key(20 + i), rays=16_384, independent=True,
+            shares=plan.shares,
+        )  # fmt: skip
+        found.append(np.asarray(slope(x, paths)).T)
+    _, exact = adding.slopes(S3, nm, names, independent=True)
+    surface = np.asarray(adding.skin(layers).surface)
+    exact = np.asarray(exact) / (1.0 - surface)
+    mean, error = np.mean(found, axis=0), np.std(found, axis=0, ddof=1) / math.sqrt(8)
+    assert np.all(exact < 0)
+    z = (mean - exact) / error
+    assert np.abs(z).max() < 6  # of Student's t with 7 degrees of freedom
+    # few of the paths meet what is not there, which makes its slope right and noisy
+    assert np.all(error[1:, :3] < 0.25 * np.abs(exact[1:, :3]))
+
+
 # --- sharing, absorbing, repeating ---------------------------------------------------------------
 
 
