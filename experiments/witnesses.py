@@ -141,8 +141,7 @@ def _one(number: int, seed: int) -> dict[str, Any]:
 
 
 def _walked(specimen: Specimen, layers: Any, key: jax.Array, independent: bool):
-    own = specimen.index_dispersion != 0  # paths serve no other wavelength
-    plan = walker.own_plan(layers, ABSORB) if own else walker.plan(layers)
+    plan, own = walker.plan_or_own(layers, ABSORB)
     paths = walker.walk(
         plan.layers, specimen.melanosome_form, key, rays=RAYS, independent=independent,
         shares=plan.shares,

@@ -260,8 +260,7 @@ def _walk(
     if smooth:
         specimen = specimen.replace(roughness=0.0)
     medium = specimen.layers(nm)
-    own_only = specimen.index_dispersion != 0
-    plan = walker.own_plan(medium, ABSORB) if own_only else walker.plan(medium)
+    plan, own_only = walker.plan_or_own(medium, ABSORB)
     angle = math.radians(incidence)
     batch = min(walker.BATCH, rays)
     total, sent = None, 0
@@ -280,9 +279,7 @@ def _walk(
             bar.update(batch)
     assert total is not None
     index = np.asarray(medium.index, float)[0]
-    surface = np.array(
-        [fresnel.surface_reflectance(angle, 1.0, n, specimen.roughness) for n in index.tolist()]
-    )
+    surface = fresnel.surface_reflectances(angle, index, specimen.roughness)
     entered = (1.0 - surface)[:, None]
     mean, square = total[0].T / sent, total[1].T / sent
     error = np.sqrt(np.maximum(square - mean**2, 0.0) / sent)

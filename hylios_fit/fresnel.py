@@ -174,6 +174,11 @@ def surface_reflectance(
     return float(reflected / (reflected + entered))
 
 
+def surface_reflectances(incidence: float, index: np.ndarray, roughness: float) -> np.ndarray:
+    """`surface_reflectance` from air, for each index below."""
+    return np.array([surface_reflectance(incidence, 1.0, float(n), roughness) for n in index])
+
+
 CURVE = (1.25, 1.8)  # indices between which `surface_curve` holds
 
 
@@ -181,5 +186,5 @@ CURVE = (1.25, 1.8)  # indices between which `surface_curve` holds
 def surface_curve(incidence: float, roughness: float) -> np.polynomial.Polynomial:
     """`surface_reflectance` from air as a polynomial of the index below, right to 1e-8."""
     nodes = 0.5 * (CURVE[0] + CURVE[1] + (CURVE[1] - CURVE[0]) * np.cos(np.pi * np.arange(13) / 12))
-    values = [surface_reflectance(incidence, 1.0, float(n), roughness) for n in nodes]
+    values = surface_reflectances(incidence, nodes, roughness)
     return np.polynomial.Polynomial.fit(nodes, values, 10, domain=CURVE)

@@ -72,13 +72,13 @@ def simulate(
         return _added(specimen, nm, math.radians(incidence), tolerance, independent_particles)
     if key is None:
         raise HyliosError(f"method {method!r} draws random numbers: give key=jax.random.key(seed)")
-    index = np.asarray(specimen.layers(nm).index)
+    medium = specimen.layers(nm)
     angle = math.radians(incidence)
-    surface = np.array(
-        [fresnel.surface_reflectance(angle, 1.0, float(n), specimen.roughness) for n in index[0]]
-    )
+    surface = fresnel.surface_reflectances(angle, np.asarray(medium.index[0]), specimen.roughness)
     run = _walked if method == "walker" else _traced
-    return run(specimen, nm, surface, rays, key, angle, tolerance, independent_particles, progress)
+    return run(
+        specimen, medium, nm, surface, rays, key, angle, tolerance, independent_particles, progress
+    )
 
 
 def with_covariance(
@@ -129,11 +129,10 @@ def check_request(
         raise HyliosError(f"tolerance is a standard error above 0, got {tolerance:g}")
 
 
-def _walked(specimen, nm, surface, rays, key, angle, tolerance, independent, progress) -> Curve:
-    medium = specimen.layers(nm)
-    # a refractive index that depends on the wavelength bends every path its own way
-    own_only = specimen.index_dispersion != 0
-    plan = walker.own_plan(medium, ABSORB) if own_only else walker.plan(medium)
+def _walked(
+    specimen, medium, nm, surface, rays, key, angle, tolerance, independent, progress
+) -> Curve:
+    plan, own_only = walker.plan_or_own(medium, ABSORB)
     batch = min(walker.BATCH, rays) if tolerance is None else walker.BATCH
     total = None
     sent = 0
@@ -168,8 +167,9 @@ def _walked(specimen, nm, surface, rays, key, angle, tolerance, independent, pro
     )  # fmt: skip
 
 
-def _traced(specimen, nm, surface, rays, key, angle, tolerance, independent, progress) -> Curve:
-    medium = specimen.layers(nm)
+def _traced(
+    specimen, medium, nm, surface, rays, key, angle, tolerance, independent, progress
+) -> Curve:
     melanin = skin.melanin_coefficient(specimen.values, nm)
     inside, at_once, sent = np.zeros(nm.shape), np.zeros(nm.shape), np.zeros(nm.shape, int)
     batch = min(ANALOG_BATCH, rays)

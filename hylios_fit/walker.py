@@ -713,6 +713,14 @@ def own_plan(layers: Layers, absorb: float) -> Plan:
     return Plan(columns, hero_shares(layers.theta_0))
 
 
+def plan_or_own(layers: Layers, absorb: float) -> tuple[Plan, bool]:
+    """`plan`; or `own_plan`, and True, where the refractive index depends on the wavelength and
+    bends every path its own way."""
+    if np.ptp(np.asarray(layers.index), axis=1).any():
+        return own_plan(layers, absorb), True
+    return plan(layers), False
+
+
 def log_density(layers: Layers, absorb: float = 1.0) -> Float[Array, "16 w"]:
     """Coefficients of the sums along a path in the logarithm of its density at each wavelength.
 
