@@ -44,11 +44,8 @@ def run(
         for form in surrogate.forms:
             member = surrogate.at(form)
             key = jax.random.fold_in(jax.random.key(seed), 100 + number)
-            if kind == "usual":
-                vector = state_vector(member.names, member.lower, member.upper)
-                rows = vector.prior_draws(key, each)
-            else:
-                rows = training.fresh(member, each, key)
+            free = ("usual",) if kind == "usual" else member.names
+            rows = training.fresh(member, each, key, free)
             truth = _solved(member.names, form, rows, progress)
             parts[form] = np.asarray(member(rows.astype(np.float32)), float), truth
         told = {form: _errors(nm, *pair) for form, pair in parts.items()}

@@ -42,7 +42,7 @@ def run(
     }  # fmt: skip
     names = (*table.NAMES, *training.FURTHER)
     vector = _Box(names)
-    given = training.fresh(vector, fresh, jax.random.fold_in(jax.random.key(seed), 300))
+    given = training.fresh(vector, fresh, jax.random.fold_in(jax.random.key(seed), 300), names)
     lots = [given[i : i + training.TOGETHER] for i in range(0, fresh, training.TOGETHER)]
     truth = np.concatenate([training.solve(names, FORM, lot) for lot in lots])
     index = np.asarray(table.layers_of(names, FORM)(given).index[:, 0], float)

@@ -108,6 +108,8 @@ DESIGN = (
 NAMES = tuple(axis.name for axis in DESIGN)
 PATHS = np.array([axis.paths for axis in DESIGN])
 INDICES = np.array([axis.name.startswith("index_") for axis in DESIGN])
+USUAL = NAMES.index("lipids") + 1  # pigments, blood, water, lipids
+PLAIN = 5
 SHIFT = (-0.04, 0.12)
 """The refractive indices of a row are moved together by as much as `index_dispersion` moves them
 within the spectrum: so the table knows what that does without a spectrum of indices in each row."""
@@ -125,31 +127,46 @@ def design(rows: int, seed: int = 0, generator: str = "walker") -> tuple[np.ndar
 
     Scrambled Sobol sequences, one group of `SHARE` rows for each form in turn, so that the first
     rows of a larger table are those of a smaller one. Rows of a group agree in what changes paths
-    (`walker`), or in the indices, which the streams depend on (`adding`).
+    (`walker`), or in the indices, which the streams depend on (`adding`). Every `PLAIN`-th group is
+    of the model as published, where the first `USUAL` parameters alone move: an edge of the box,
+    and what is asked for most.
     """
-    from scipy.stats import qmc
-
     groups = -(-rows // (SHARE * len(FORMS)))
+    plain = np.arange(groups) % PLAIN == PLAIN - 1
     together = PATHS if generator == "walker" else INDICES
+    values = np.tile(Specimen().parameters(NAMES), (groups, SHARE, 1))
+    values[~plain], place = _groups(int(np.sum(~plain)), np.arange(len(NAMES)), together, seed, 0)
+    shift = SHIFT[0] + (SHIFT[1] - SHIFT[0]) * place
+    values[np.ix_(~plain, np.arange(SHARE), INDICES)] += shift[:, None, None]
+    some = np.arange(USUAL)
+    values[plain, :, :USUAL] = _groups(int(np.sum(plain)), some, together, seed, 2)[0]
+    both = np.repeat(values[:, None], len(FORMS), axis=1).reshape(-1, len(NAMES))
+    form = np.arange(len(both)) // SHARE % len(FORMS)
+    return both[:rows], form[:rows]
+
+
+def _groups(
+    count: int, axes: np.ndarray, together: np.ndarray, seed: int, stream: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values (count, SHARE, axes) by two Sobol sequences, of the groups and of the rows, and one
+    more number of each group."""
+    from scipy.stats import qmc
 
     def sobol(dimensions: int, count: int, stream: int) -> np.ndarray:
         points = qmc.Sobol(dimensions, rng=np.random.default_rng([seed, stream]))
         return points.random(1 << int(np.ceil(np.log2(max(count, 2)))))[:count]
 
-    common = np.repeat(sobol(int(together.sum()) + 1, groups, 0), SHARE, axis=0)
-    unit = np.empty((groups * SHARE, len(DESIGN)))
-    unit[:, together] = common[:, 1:]
-    unit[:, ~together] = sobol(int((~together).sum()), groups * SHARE, 1)
+    alike = together[axes]
+    common = sobol(int(alike.sum()) + 1, count, stream)
+    unit = np.empty((count, SHARE, len(axes)))
+    unit[..., alike] = common[:, None, 1:]
+    own = sobol(int((~alike).sum()), count * SHARE, stream + 1)
+    unit[..., ~alike] = own.reshape(count, SHARE, -1)
     columns = (
-        spread(u, axis.lower, axis.upper, axis.spread)
-        for u, axis in zip(unit.T, DESIGN, strict=True)
+        spread(unit[..., i], DESIGN[axis].lower, DESIGN[axis].upper, DESIGN[axis].spread)
+        for i, axis in enumerate(axes)
     )
-    values = np.stack(list(columns), axis=1)
-    values[:, INDICES] += SHIFT[0] + (SHIFT[1] - SHIFT[0]) * common[:, :1]
-    grouped = values.reshape(groups, 1, SHARE, -1)
-    both = np.repeat(grouped, len(FORMS), axis=1).reshape(groups * len(FORMS) * SHARE, -1)
-    form = np.arange(len(both)) // SHARE % len(FORMS)
-    return both[:rows], form[:rows]
+    return np.stack(list(columns), axis=-1), common[:, 0]
 
 
 @lru_cache(maxsize=8)

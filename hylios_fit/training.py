@@ -39,12 +39,12 @@ from hylios_fit.table import layers_of, read_table, solve_rows, spread, surface_
 FURTHER = {"index_dispersion": (-0.005, 0.035)}
 """Ranges of parameters that the table has no axis for and its indices cover."""
 LOCAL_HIDDEN = (128, 128, 128)
-LOCAL_STEPS = 600_000
+LOCAL_STEPS = 400_000
 LOCAL_BATCH = 256
-SPECIMENS = 163_840  # of each form, that the local regression answers for
+SPECIMENS = 131_072  # of each form, that the local regression answers for
 COMPONENTS = 80
 HIDDEN = (192, 192)
-STEPS = 500_000
+STEPS = 400_000
 BATCH = 128
 RATES = tuple((3e-3 * 0.5**k, 1 / 9) for k in range(9))  # and the share of the steps
 LEAST_ROWS = 64  # of each form
@@ -66,8 +66,8 @@ def train(
     """Train on the table and write the surrogate; returns the report that `check` prints.
 
     Its error is measured on `checks` fresh specimens of each form, drawn from the prior of the
-    fits with every parameter free and solved without noise by adding-doubling, whichever generator
-    made the table.
+    fits, half with the usual parameters free and half with every one, and solved without noise by
+    adding-doubling, whichever generator made the table.
     """
     from hylios_fit import __version__
 
@@ -123,12 +123,11 @@ def train(
     return check_report(load_surrogate(path))
 
 
-def fresh(member: Any, count: int, key: Array) -> np.ndarray:
-    """(count, P) specimens from the prior with every parameter free; `TOGETHER` in turn have the
+def fresh(member: Any, count: int, key: Array, free: tuple[str, ...] = ("usual",)) -> np.ndarray:
+    """(count, P) specimens from the prior with these parameters free; `TOGETHER` in turn have the
     same refractive indices, so that they can be solved together."""
     names = member.names
-    vector = state_vector(names, member.lower, member.upper, free=names)
-    drawn = vector.prior_draws(key, count)
+    drawn = state_vector(names, member.lower, member.upper, free).prior_draws(key, count)
     alike = [i for i, name in enumerate(names) if name.startswith("index_")]
     first = np.arange(count) // TOGETHER * TOGETHER
     drawn[:, alike] = drawn[first][:, alike]
@@ -143,8 +142,11 @@ def _check(
     from tqdm import tqdm
 
     key = jax.random.fold_in(jax.random.key(seed), 1)
-    # the same for each form
-    drawn = fresh(surrogate.at(surrogate.forms[0]), checks, key)
+    member = surrogate.at(surrogate.forms[0])
+    part = checks // 2  # the same for each form
+    drawn = np.concatenate(
+        [fresh(member, checks - part, key), fresh(member, part, key, member.names)]
+    )
     found = {}
     total = checks * len(surrogate.forms)
     with (
@@ -357,21 +359,27 @@ def _fits(
 def _specimens(
     box: dict[str, tuple[float, float]], spreads: dict[str, str], seed: int
 ) -> np.ndarray:
-    """(SPECIMENS, P): a quarter spread over the box as the table is, the rest from the prior."""
+    """(SPECIMENS, P): a fifth spread over the box as the table is, the rest from the prior, half
+    of it with the usual parameters free and half with all."""
     from scipy.stats import qmc
 
-    part = SPECIMENS // 4
+    part = SPECIMENS // 5
     sobol = qmc.Sobol(len(box), rng=np.random.default_rng([seed, 2]))
     unit = sobol.random(1 << math.ceil(math.log2(part)))[:part]
     over = [
         spread(u, low, high, spreads.get(name, "linear"))
         for u, (name, (low, high)) in zip(unit.T, box.items(), strict=True)
     ]
-    vector = state_vector(
-        tuple(box), [low for low, _ in box.values()], [high for _, high in box.values()], tuple(box)
-    )
-    drawn = vector.prior_draws(jax.random.fold_in(jax.random.key(seed), 2), SPECIMENS - part)
-    return np.concatenate([np.stack(over, axis=1), drawn])
+    names, (lower, upper) = tuple(box), np.array(list(box.values())).T
+    drawn = [
+        state_vector(names, lower, upper, free).prior_draws(
+            jax.random.fold_in(jax.random.key(seed), 2 + number), count
+        )
+        for number, (free, count) in enumerate(
+            ((("usual",), 2 * part), (names, SPECIMENS - 3 * part))
+        )
+    ]
+    return np.concatenate([np.stack(over, axis=1), *drawn])
 
 
 def _network(
