@@ -161,7 +161,7 @@ def _groups(
     unit = np.empty((count, SHARE, len(axes)))
     unit[..., alike] = common[:, None, 1:]
     own = sobol(int((~alike).sum()), count * SHARE, stream + 1)
-    unit[..., ~alike] = own.reshape(count, SHARE, -1)
+    unit[..., ~alike] = own.reshape(count, SHARE, own.shape[1])
     columns = (
         spread(unit[..., i], DESIGN[axis].lower, DESIGN[axis].upper, DESIGN[axis].spread)
         for i, axis in enumerate(axes)

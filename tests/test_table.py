@@ -52,13 +52,20 @@ def read(path):
     return {name: stored[name].to_numpy() for name in ("reflectance", "standard_error", "design")}
 
 
+def published(rows):
+    """Which rows are of the model as published."""
+    group = np.arange(rows) // (table.SHARE * len(table.FORMS))
+    return group % table.PLAIN == table.PLAIN - 1
+
+
 # --- the design ----------------------------------------------------------------------------------
 
 
 def test_the_design_lies_in_its_ranges_and_fills_them():
-    parameters, form = table.design(1024)
-    assert parameters.shape == (1024, len(table.NAMES))
-    for column, axis in zip(parameters.T, table.DESIGN, strict=True):
+    parameters, form = table.design(1280)
+    assert parameters.shape == (1280, len(table.NAMES))
+    wide = parameters[~published(1280)]
+    for column, axis in zip(wide.T, table.DESIGN, strict=True):
         assert axis.source
         below, above = table.SHIFT if axis.name.startswith("index_") else (0.0, 0.0)
         assert axis.lower + below <= column.min() < column.max() <= axis.upper + above
@@ -71,13 +78,26 @@ def test_the_design_lies_in_its_ranges_and_fills_them():
         u **= {"square": 1 / 2, "cube": 1 / 3}.get(axis.spread, 1)
         counts, _ = np.histogram(u, 8, (0, 1))
         assert counts.min() > 100  # of 128
-    assert list(np.bincount(form)) == [512, 512]
+    assert list(np.bincount(form)) == [640, 640]
+
+
+def test_every_fifth_group_is_of_the_model_as_published():
+    from hylios_fit.statevector import PRIORS
+
+    assert [PRIORS[name].usual for name in table.NAMES] == [
+        i < table.USUAL for i in range(len(table.NAMES))
+    ]
+    plain = table.design(1280)[0][published(1280)]
+    assert len(plain) == 256
+    usual = table.Specimen().parameters(table.NAMES)
+    np.testing.assert_array_equal(plain[:, table.USUAL :], np.tile(usual[table.USUAL :], (256, 1)))
+    assert np.all(np.ptp(plain[:, : table.USUAL], axis=0) > 0)
 
 
 def test_the_indices_of_a_row_are_moved_together_as_dispersion_moves_them():
     from hylios_fit import skin, training
 
-    parameters, _ = table.design(4096, generator="adding")
+    parameters = table.design(4096, generator="adding")[0][~published(4096)]
     own = np.array([(axis.lower, axis.upper) for axis in table.DESIGN])[table.INDICES]
     index = parameters[:, table.INDICES]
     # one shift, of those that there are, brings all four into their ranges
