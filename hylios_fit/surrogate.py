@@ -62,10 +62,14 @@ def features(
 ) -> Float[Array, "... f"]:
     """What the regression sees, before standardising: each parameter, and the logarithms of the
     optical depth (absorption) of epidermis, papillary and reticular dermis at `FEATURES_NM`."""
-    at = {name: parameters[..., i] for i, name in enumerate(names)}
+    if parameters.ndim > 1:
+        rows = parameters.reshape(-1, len(names))
+        found = jax.vmap(lambda row: features(names, form, row))(rows)
+        return found.reshape(*parameters.shape[:-1], -1)
+    at = {name: parameters[i] for i, name in enumerate(names)}
     own = [jnp.log(x + OFFSETS[name]) if name in OFFSETS else x for name, x in at.items()]
     v = {**Specimen().values, **at}
-    v = {name: jnp.asarray(value, parameters.dtype)[..., None] for name, value in v.items()}
+    v = {name: jnp.asarray(value, parameters.dtype) for name, value in v.items()}
     melanin = skin.melanin_coefficient(v, FEATURES_NM, parameters.dtype)
     blood = skin.blood_coefficient(v, FEATURES_NM, parameters.dtype)
     rest = [skin.base_coefficient(v, i, FEATURES_NM, parameters.dtype) for i in range(len(LAYERS))]
@@ -82,7 +86,7 @@ def features(
         mu = rest[i] + v[f"blood_{part}"] / 100 * blood
         depths.append(mu * v[f"thickness_{part}"])
     logs = [jnp.log(depth + FAINT) for depth in depths]
-    return jnp.concatenate([jnp.stack(own, axis=-1), *logs], axis=-1)
+    return jnp.concatenate([jnp.stack(own), *logs])
 
 
 class Member(eqx.Module):
@@ -104,7 +108,7 @@ class Member(eqx.Module):
     components: Float[Array, "k c"] | None  # None: of few bands, part of the last weights
     mean: Float[Array, "c"]
     fresnel: Float[Array, "q"]  # what the surface reflects, a polynomial of the index above 1.5
-    dispersion: Float[Array, "b"]  # what `index_dispersion` is multiplied by
+    dispersion: Float[Array, "c"]  # what `index_dispersion` is multiplied by
     wavelength_nm: np.ndarray  # of the bands
     readout: Float[Array, "c b"] | None  # bands from the wavelengths; None: they are the bands
     modes: Float[Array, "m b"]  # of the logarithm's error: modes.T @ modes + diag(rest)
@@ -135,16 +139,20 @@ class Member(eqx.Module):
         if self.components is not None:
             x = jnp.matmul(x, self.components, precision=PRECISION)
         log = x + self.mean.reshape(like)
-        bands = jnp.exp(log) - FLOOR
-        if self.readout is not None:
-            bands = jnp.matmul(bands, self.readout, precision=PRECISION)
-        surface = self.surface_at(bounded)
-        bands = surface + (1.0 - surface) * bands
+        surface = self._surface(bounded)
+        bands = self._read(surface + (1.0 - surface) * (jnp.exp(log) - FLOOR))
         return jnp.where(inside, bands, jnp.nan)
+
+    def _read(self, columns: Float[Array, "... c"]) -> Float[Array, "... b"]:
+        if self.readout is None:
+            return columns
+        return jnp.matmul(columns, self.readout, precision=PRECISION)
 
     def surface_at(self, parameters: Any) -> Float[Array, "... b"]:
         """What the surface reflects at once: what an instrument with a gloss trap does not see."""
-        p = jnp.asarray(parameters, self.centre.dtype)
+        return self._read(self._surface(jnp.asarray(parameters, self.centre.dtype)))
+
+    def _surface(self, p: Float[Array, "... p"]) -> Float[Array, "... c"]:
         like = (1,) * (p.ndim - 1) + (-1,)
         usual = Specimen().values
         corneum, dispersion = (
@@ -253,7 +261,7 @@ class Member(eqx.Module):
             biases=biases,
             components=components,
             mean=self.mean[used],
-            dispersion=jnp.asarray(w @ np.asarray(self.dispersion, float), dtype),
+            dispersion=self.dispersion[used],
             wavelength_nm=w @ grid if wavelength_nm is None else np.asarray(wavelength_nm, float),
             readout=None
             if np.array_equal(readout, np.eye(len(used)))

@@ -302,9 +302,9 @@ def learn_locally(
 
     @jax.jit
     def answer(x: Array) -> Array:
-        x = (x - centre) / scale
+        x = (x - centre[None, None]) / scale[None, None]
         for i, (w, b) in enumerate(zip(weights, biases, strict=True)):
-            x = x @ w + b
+            x = x @ w + b[None, None]
             if i < len(weights) - 1:
                 x = jnp.tanh(x)
         return x[..., 0] * unit + middle

@@ -282,13 +282,16 @@ def test_a_table_is_made_trained_from_and_checked(folder, monkeypatch, capsys):
         depth = parameters[:, 3:4] * (500 / table.WAVELENGTHS) ** 3 / 5
         return 0.05 + 0.6 * np.exp(-depth), np.full(depth.shape, 1e-3)
 
-    def fresh(parameters, form):
-        return stand_in(parameters[None], form, None, 1)[0][0]
+    def solve(names, form, rows):
+        return stand_in(rows, form, None, 1)[0]
 
     monkeypatch.setattr(table, "walk_rows", stand_in)
-    monkeypatch.setattr(training, "fresh", fresh)
-    monkeypatch.setattr(training, "HIDDEN", (8, 8))
-    monkeypatch.setattr(training, "EPOCHS", 16)
+    monkeypatch.setattr(training, "solve", solve)
+    for name, value in (
+        ("HIDDEN", (8, 8)), ("LOCAL_HIDDEN", (8, 8)), ("STEPS", 90), ("LOCAL_STEPS", 90),
+        ("SPECIMENS", 512), ("COMPONENTS", 8),
+    ):  # fmt: skip
+        monkeypatch.setattr(training, name, value)
     assert run("table", "-o", "t.zarr", "--rows", 256, "--seed", 5) == 0
     assert run("table", "-o", "t.zarr", "--rows", 256) == 2
     assert "--resume" in capsys.readouterr().err
