@@ -391,6 +391,9 @@ def _network(
     The penalty is that of the most probable weights, where they have variance 1/width and each
     target has noise of this variance.
     """
+    import warnings
+
+    from sklearn.exceptions import ConvergenceWarning
     from sklearn.neural_network import MLPRegressor
 
     lot: Any = min(batch, len(x))
@@ -402,7 +405,9 @@ def _network(
     for rate, share in RATES:
         epochs = max(round(share * steps * lot / len(x)), 1)
         network.set_params(learning_rate_init=rate, max_iter=epochs)
-        network.fit(x, y)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)  # epochs are fixed beforehand
+            network.fit(x, y)
         if bar is not None:
             bar.update()
     return network
