@@ -18,9 +18,9 @@ from hylios_fit import fresnel, table, training
 from hylios_fit.skin import Specimen
 from hylios_fit.surrogate import FLOOR
 
-ROWS = (512, 1024, 2048)
-STEPS = 100_000
-FRESH = 128
+ROWS = (256, 512, 1024)
+STEPS = 40_000
+FRESH = 64
 FORM = "complex"
 SEED = 20150413  # of the tables
 
