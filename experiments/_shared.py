@@ -6,7 +6,7 @@ import ast
 import functools
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,22 @@ def checkpoint(name: str, modules: Iterable[str], **settings: Any) -> Path:
     folder = CACHE / name / digest.hexdigest()[:16]
     folder.mkdir(parents=True, exist_ok=True)
     return folder
+
+
+def kept(folder: Path, name: str, make: Callable[[], Any]) -> Any:
+    """A part of a long run from its file; made, and named on the terminal, if it is not there."""
+    path = folder / f"{name}.json"
+    if not path.exists():
+        print(name, flush=True)
+        save_json(path, make())
+    return json.loads(path.read_text())
+
+
+def save_json(path: Path, content: Any) -> None:
+    """Write a .json file whole or not at all."""
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(content))
+    partial.replace(path)
 
 
 def save_arrays(path: Path, **arrays: Any) -> None:

@@ -7,7 +7,6 @@ for tolerances from 0.0005 to 0.02, on specimens that no plan has seen.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from typing import Any
@@ -58,13 +57,8 @@ def run(seed: int = 0) -> dict[str, Any]:
     )
     found: dict[str, Any] = {}
     for name, scene in scenes().items():
-        path = folder / f"{name.split(',')[0]}.json"
-        if not path.exists():
-            print(name, flush=True)
-            partial = path.with_suffix(".partial")
-            partial.write_text(json.dumps(_scene(scene, seed)))
-            partial.replace(path)
-        found[name] = json.loads(path.read_text())
+        part = name.split(",")[0]
+        found[name] = _shared.kept(folder, part, lambda scene=scene: _scene(scene, seed))
     return {
         "tolerances": TOLERANCES,
         "fresh": FRESH,

@@ -10,7 +10,6 @@ it is carried on as 1/sqrt(rays), with the time of a ray measured at 8192.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Mapping
 from functools import lru_cache
@@ -99,12 +98,8 @@ def specimens(regime: str, seed: int) -> tuple[Specimen, ...]:
 @lru_cache
 def _coefficients(form: str, nm: tuple[float, ...]) -> Callable[[Any], Layers]:
     """Rows of all parameters -> layers side by side, as `adding` takes them, compiled."""
-
-    def one(row):
-        values = dict(zip(SPECS, row, strict=True))
-        return skin.let_stand(skin.layers(values, form, np.array(nm)), values, form)
-
-    return jax.jit(lambda rows: skin.side_by_side(jax.vmap(one)(rows)))
+    of = table.layers_of(tuple(SPECS), form, wavelength_nm=nm)
+    return jax.jit(lambda rows: skin.side_by_side(of(rows)))
 
 
 def layers_of(given: tuple[Specimen, ...], nm: np.ndarray) -> Layers:
@@ -143,9 +138,7 @@ def surface(index: float) -> tuple[float, float]:
     cos = (np.arange(4000) + 0.5) / 4000
     sin = index * np.sqrt(1.0 - cos**2)
     out = np.sqrt(np.clip(1.0 - sin**2, 0.0, None))
-    r_s = (index * cos - out) / (index * cos + out)
-    r_p = (index * out - cos) / (index * out + cos)
-    inside = np.where(sin < 1.0, 0.5 * (r_s**2 + r_p**2), 1.0)
+    inside = np.where(sin < 1.0, fresnel.unpolarised(cos, out, index, 1.0), 1.0)
     return outside, float(2.0 * np.mean(inside * cos))
 
 
@@ -338,13 +331,7 @@ class _Parts:
         self.folder = _shared.checkpoint("speed_accuracy", modules, **settings)
 
     def __call__(self, name: str, make: Callable[[], Any]) -> Any:
-        path = self.folder / f"{name}.json"
-        if not path.exists():
-            print(name, flush=True)
-            partial = path.with_suffix(".partial")
-            partial.write_text(json.dumps(make()))
-            partial.replace(path)
-        return json.loads(path.read_text())
+        return _shared.kept(self.folder, name, make)
 
 
 def rms(found: np.ndarray, truth: np.ndarray) -> float:

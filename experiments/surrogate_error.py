@@ -45,7 +45,7 @@ def run(
             member = surrogate.at(form)
             key = jax.random.fold_in(jax.random.key(seed), 100 + number)
             free = ("usual",) if kind == "usual" else member.names
-            rows = training.fresh(member, each, key, free)
+            rows = training.fresh(member.names, member.lower, member.upper, each, key, free)
             truth = _solved(member.names, form, rows, progress)
             parts[form] = np.asarray(member(rows.astype(np.float32)), float), truth
         told = {form: _errors(nm, *pair) for form, pair in parts.items()}

@@ -40,9 +40,10 @@ def run(
         "rows": list(rows), "steps": steps, "fresh": fresh, "form": FORM,
         "cores": os.cpu_count(), "rays": table.RAYS, "share": table.SHARE, "generators": {},
     }  # fmt: skip
-    names = (*table.NAMES, *training.FURTHER)
-    vector = _Box(names)
-    given = training.fresh(vector, fresh, jax.random.fold_in(jax.random.key(seed), 300), names)
+    box = {axis.name: (axis.lower, axis.upper) for axis in table.DESIGN} | training.FURTHER
+    names, (lower, upper) = tuple(box), np.array(list(box.values())).T
+    key = jax.random.fold_in(jax.random.key(seed), 300)
+    given = training.fresh(names, lower, upper, fresh, key, names)
     lots = [given[i : i + training.TOGETHER] for i in range(0, fresh, training.TOGETHER)]
     truth = np.concatenate([training.solve(names, FORM, lot) for lot in lots])
     index = np.asarray(table.layers_of(names, FORM)(given).index[:, 0], float)
@@ -51,7 +52,7 @@ def run(
         path, took = _table(folder, generator, max(rows), progress)
         whole = table.read_table(path)
         used = partial(_learned, whole, steps=steps, seed=seed)
-        with ThreadPoolExecutor(2) as pool:
+        with training.quietly(), ThreadPoolExecutor(training.THREADS) as pool:
             learned = list(pool.map(used, rows))
         errors = []
         for answer in learned:
@@ -68,15 +69,6 @@ def run(
     return found
 
 
-class _Box:
-    """Names and ranges, as `training.fresh` asks for them."""
-
-    def __init__(self, names: tuple[str, ...]) -> None:
-        ranges = {axis.name: (axis.lower, axis.upper) for axis in table.DESIGN} | training.FURTHER
-        self.names = names
-        self.lower, self.upper = np.array([ranges[name] for name in names]).T
-
-
 def _table(folder: Path, generator: str, rows: int, progress: bool) -> tuple[Path, float]:
     path, note = folder / f"small_{generator}.zarr", folder / f"small_{generator}.json"
     if not note.exists():
@@ -89,10 +81,7 @@ def _table(folder: Path, generator: str, rows: int, progress: bool) -> tuple[Pat
 
 
 def _learned(whole: Any, rows: int, steps: int, seed: int) -> Any:
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(1):
-        return training.learn_locally(whole.isel(row=slice(0, rows)), FORM, seed, steps=steps)
+    return training.learn_locally(whole.isel(row=slice(0, rows)), FORM, seed, steps=steps)
 
 
 def draw(result: dict[str, Any], path: Any) -> None:

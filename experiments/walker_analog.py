@@ -108,9 +108,7 @@ def _analog(
                 key=jax.random.fold_in(own, lot),
             )  # fmt: skip
             done.append(float(curve.reflectance[0]))
-            partial = path.with_suffix(".partial")
-            partial.write_text(json.dumps(done))
-            partial.replace(path)
+            _shared.save_json(path, done)
         found.append(np.mean(done[:lots]))
         bar.update(1)
     mean, sent = np.array(found), lots * ANALOG_LOT

@@ -312,18 +312,19 @@ def side_by_side(
 
 @lru_cache(maxsize=32)
 def _coefficients(form: str, nm: tuple[float, ...]) -> Callable[[Any, Any], Layers]:
-    def one(row, there):
-        values = dict(zip(SPECS, row, strict=True))
-        medium = skin.let_stand(skin.layers(values, form, np.array(nm)), values, form)
-        return medium._replace(
-            mu_a=medium.mu_a * there[:, None],
-            mu_particle=medium.mu_particle * there[:, None],
-            mu_fibre=medium.mu_fibre * there[4],
-            mu_tissue=medium.mu_tissue * there[:, None],
-        )
+    of = table.layers_of(tuple(SPECS), form, wavelength_nm=nm)
 
     def every(rows, there):
-        return skin.side_by_side(jax.vmap(one)(rows, there))
+        medium = of(rows)
+        each = there[:, :, None]
+        return skin.side_by_side(
+            medium._replace(
+                mu_a=medium.mu_a * each,
+                mu_particle=medium.mu_particle * each,
+                mu_fibre=medium.mu_fibre * each[:, 4],
+                mu_tissue=medium.mu_tissue * each,
+            )
+        )
 
     return jax.jit(every)
 

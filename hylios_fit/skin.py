@@ -285,6 +285,23 @@ def base_coefficient(
     )
 
 
+def absorption(
+    values: Mapping[str, Any], wavelength_nm: np.ndarray, dtype: Any = None
+) -> dict[str, Float[Array, "w"]]:
+    """Absorption coefficient of each layer in 1/cm, without the melanosomes (Eq. 2)."""
+    melanin = melanin_coefficient(values, wavelength_nm, dtype)
+    blood = blood_coefficient(values, wavelength_nm, dtype)
+    mu_a = {}
+    for i, layer in enumerate(LAYERS):
+        own = base_coefficient(values, i, wavelength_nm, dtype)
+        if layer in STRATA:
+            own = own + values["colloidal_melanin"] / 100 * melanin
+        if layer in ("papillary", "reticular"):
+            own = own + values[f"blood_{layer}"] / 100 * blood
+        mu_a[layer] = own
+    return mu_a
+
+
 def dispersion(wavelength_nm: np.ndarray) -> np.ndarray:
     """What `index_dispersion` adds to every index is multiplied by, (w,)."""
     return (500.0 / np.asarray(wavelength_nm, float)) ** 2 - 1.0
@@ -301,14 +318,12 @@ def layers(
     v = {name: jnp.asarray(value, dtype) for name, value in values.items()}
 
     melanin = melanin_coefficient(v, nm, dtype)
-    blood = blood_coefficient(v, nm, dtype)
     more = v["index_dispersion"] * jnp.asarray(dispersion(nm), dtype)
     parts = ("corneum", *("epidermis",) * 3, "papillary", "reticular")
     index = jnp.stack([v[f"index_{part}"] + more for part in parts])
 
-    mu_a, mu_particle, albedo = [], [], []
+    mu_particle, albedo = [], []
     for i, layer in enumerate(LAYERS):
-        own = base_coefficient(v, i, nm, dtype)
         if layer in STRATA:
             scale = melanosome.SHRINKING[layer]
             per_content = melanosome.attenuation_per_content(form, scale)
@@ -316,13 +331,9 @@ def layers(
                 v[f"melanosome_{layer}"] / 100 * per_content * jnp.ones_like(melanin)
             )
             albedo.append(melanosome.survival(form, scale, melanin, index[i]))
-            own = own + v["colloidal_melanin"] / 100 * melanin
         else:
             mu_particle.append(jnp.zeros_like(melanin))
             albedo.append(jnp.ones_like(melanin))
-        if layer in ("papillary", "reticular"):
-            own = own + v[f"blood_{layer}"] / 100 * blood
-        mu_a.append(own)
 
     radius, fraction = v["fibre_radius"], v["fibre_fraction"]
     unit_fibre = jnp.asarray(scattering.fibre_coefficient(nm, 1.0, 1.0), dtype)
@@ -331,7 +342,7 @@ def layers(
     return Layers(
         thickness=jnp.stack([v[f"thickness_{layer}"] for layer in LAYERS]),
         index=index,
-        mu_a=jnp.stack(mu_a),
+        mu_a=jnp.stack(list(absorption(v, nm, dtype).values())),
         mu_particle=jnp.stack(mu_particle),
         hit_albedo=jnp.stack(albedo),
         theta_0=jnp.asarray(scattering.melanosome_angle(nm), dtype),

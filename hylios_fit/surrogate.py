@@ -71,21 +71,15 @@ def features(
     v = {**Specimen().values, **at}
     v = {name: jnp.asarray(value, parameters.dtype) for name, value in v.items()}
     melanin = skin.melanin_coefficient(v, FEATURES_NM, parameters.dtype)
-    blood = skin.blood_coefficient(v, FEATURES_NM, parameters.dtype)
-    rest = [skin.base_coefficient(v, i, FEATURES_NM, parameters.dtype) for i in range(len(LAYERS))]
-    epidermis = rest[0] * v["thickness_corneum"]
-    for i, stratum in enumerate(STRATA, 1):
-        mu = rest[i] + v["colloidal_melanin"] / 100 * melanin
-        scale = melanosome.SHRINKING[stratum]
+    mu_a = skin.absorption(v, FEATURES_NM, parameters.dtype)
+    for layer in STRATA:
+        scale = melanosome.SHRINKING[layer]
         attenuation = melanosome.attenuation_per_content(form, scale)
         lost = -jnp.expm1(-DETOUR / attenuation * melanin)  # at a hit, about
-        mu = mu + v[f"melanosome_{stratum}"] / 100 * attenuation * lost
-        epidermis = epidermis + mu * v[f"thickness_{stratum}"]
-    depths = [epidermis]
-    for i, part in enumerate(("papillary", "reticular"), 4):
-        mu = rest[i] + v[f"blood_{part}"] / 100 * blood
-        depths.append(mu * v[f"thickness_{part}"])
-    logs = [jnp.log(depth + FAINT) for depth in depths]
+        mu_a[layer] = mu_a[layer] + v[f"melanosome_{layer}"] / 100 * attenuation * lost
+    depths = {layer: mu * v[f"thickness_{layer}"] for layer, mu in mu_a.items()}
+    epidermis = sum(depths[layer] for layer in LAYERS[:4])
+    logs = [jnp.log(depth + FAINT) for depth in (epidermis, *(depths[n] for n in LAYERS[4:]))]
     return jnp.concatenate([jnp.stack(own), *logs])
 
 
@@ -154,10 +148,8 @@ class Member(eqx.Module):
 
     def _surface(self, p: Float[Array, "... p"]) -> Float[Array, "... c"]:
         like = (1,) * (p.ndim - 1) + (-1,)
-        usual = Specimen().values
         corneum, dispersion = (
-            p[..., self.names.index(name), None] if name in self.names else usual[name]
-            for name in ("index_corneum", "index_dispersion")
+            p[..., self.names.index(name), None] for name in ("index_corneum", "index_dispersion")
         )
         above = corneum - 1.5 + dispersion * self.dispersion.reshape(like)
         found = self.fresnel[-1]
@@ -168,8 +160,7 @@ class Member(eqx.Module):
     @property
     def surface(self) -> Float[np.ndarray, "b"]:
         """`surface_at` the usual index of the corneum."""
-        usual = Specimen().parameters(self.names)
-        return np.asarray(self.surface_at(usual), float) * np.ones(len(self.wavelength_nm))
+        return _usual_surface(self)
 
     # arrays have no hash, and jax.jit wants one of what it compiles
     __hash__ = object.__hash__
@@ -427,6 +418,12 @@ def _in_blocks(function: Callable[[Any], Array], rows: Any) -> Array:
     if rows.ndim != 2 or len(rows) <= 4 * BLOCK:
         return function(rows)
     return jax.lax.map(function, rows, batch_size=BLOCK)
+
+
+@lru_cache(maxsize=32)
+def _usual_surface(member: Member) -> np.ndarray:
+    """Worked out once: every fit asks for it."""
+    return np.asarray(member.surface_at(Specimen().parameters(member.names)), float)
 
 
 class _Ready(NamedTuple):

@@ -18,7 +18,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, nullcontext, suppress
 from functools import lru_cache
@@ -107,7 +107,14 @@ DESIGN = (
 )
 NAMES = tuple(axis.name for axis in DESIGN)
 PATHS = np.array([axis.paths for axis in DESIGN])
-INDICES = np.array([axis.name.startswith("index_") for axis in DESIGN])
+
+
+def of_indices(names: Iterable[str]) -> np.ndarray:
+    """Which of the parameters (P,) the streams of the solver depend on: indices and dispersion."""
+    return np.array([name.startswith("index_") for name in names])
+
+
+INDICES = of_indices(NAMES)
 USUAL = NAMES.index("lipids") + 1  # pigments, blood, water, lipids
 PLAIN = 5
 SHIFT = (-0.04, 0.12)
@@ -171,15 +178,18 @@ def _groups(
 
 @lru_cache(maxsize=8)
 def layers_of(
-    names: tuple[str, ...], form: str, stand: bool = True
-) -> Callable[[np.ndarray], Layers]:
+    names: tuple[str, ...],
+    form: str,
+    stand: bool = True,
+    wavelength_nm: tuple[float, ...] = tuple(WAVELENGTHS.tolist()),
+) -> Callable[[Any], Layers]:
     """Parameters (n, P) -> layers with a leading axis, everything unnamed as usual; with `stand`
-    as many particles as the walks let stand."""
+    as many particles as the walks let stand. Compiled."""
     defaults = Specimen().values
 
     def one(row: jax.Array) -> Layers:
         values = {**defaults, **dict(zip(names, row, strict=True))}
-        medium = skin.layers(values, form, WAVELENGTHS)
+        medium = skin.layers(values, form, np.array(wavelength_nm))
         return skin.let_stand(medium, values, form) if stand else medium
 
     every = jax.jit(jax.vmap(one))
@@ -257,8 +267,7 @@ def solve_rows(
     medium = layers_of(names, form)(parameters)
     angle = float(np.radians(INCIDENCE_DEG))
     reflectance = np.empty((len(parameters), len(WAVELENGTHS)))
-    alike = [i for i, name in enumerate(names) if name.startswith("index_")]
-    _, group = np.unique(parameters[:, alike], axis=0, return_inverse=True)
+    _, group = np.unique(parameters[:, of_indices(names)], axis=0, return_inverse=True)
     parts = tuple(math.ceil(n * order / ADDING_ORDER) for n in ADDING_PARTS)
     for number in range(group.max() + 1):
         rows = np.flatnonzero(group == number)
@@ -395,8 +404,7 @@ def read_table(path: str | Path, least_rows: int = 1) -> xarray.Dataset:
                 f"{path} is damaged: {bad.any(axis=1).sum()} of its finished rows have no "
                 f"{name} (the first is row {row}, at {where}); make the table again"
             )
-    forms = str(table["form"].attrs["flag_meanings"]).split()
-    for number, form in enumerate(forms):
+    for number, form in enumerate(forms_of(table)):
         count = int((table["form"].values == number).sum())
         if count < least_rows:
             raise HyliosError(
@@ -404,6 +412,11 @@ def read_table(path: str | Path, least_rows: int = 1) -> xarray.Dataset:
                 f"{least_rows}: go on with `hylios-fit table --resume`, or ask it for more --rows"
             )
     return table
+
+
+def forms_of(table: xarray.Dataset) -> list[str]:
+    """The melanosome forms that the numbers in `form` stand for."""
+    return str(table["form"].attrs["flag_meanings"]).split()
 
 
 def generate(

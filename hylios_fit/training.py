@@ -11,8 +11,9 @@ axis for them (`index_dispersion`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,16 @@ from hylios_fit.surrogate import (
     load_surrogate,
     save,
 )
-from hylios_fit.table import layers_of, read_table, solve_rows, spread, surface_share
+from hylios_fit.table import (
+    forms_of,
+    layers_of,
+    of_indices,
+    read_table,
+    solve_rows,
+    spread,
+    surface_share,
+)
+from hylios_fit.threads import one_blas_thread
 
 FURTHER = {"index_dispersion": (-0.005, 0.035)}
 """Ranges of parameters that the table has no axis for and its indices cover."""
@@ -72,7 +82,7 @@ def train(
     from hylios_fit import __version__
 
     table = read_table(table_path, LEAST_ROWS)
-    forms = tuple(str(table["form"].attrs["flag_meanings"]).split())
+    forms = tuple(forms_of(table))
     nm = table["wavelength_nm"].values
     box = {
         str(name): (float(low), float(high))
@@ -123,12 +133,14 @@ def train(
     return check_report(load_surrogate(path))
 
 
-def fresh(member: Any, count: int, key: Array, free: tuple[str, ...] = ("usual",)) -> np.ndarray:
-    """(count, P) specimens from the prior with these parameters free; `TOGETHER` in turn have the
-    same refractive indices, so that they can be solved together."""
-    names = member.names
-    drawn = state_vector(names, member.lower, member.upper, free).prior_draws(key, count)
-    alike = [i for i, name in enumerate(names) if name.startswith("index_")]
+def fresh(
+    names: tuple[str, ...], lower: Any, upper: Any, count: int, key: Array,
+    free: tuple[str, ...] = ("usual",),
+) -> np.ndarray:  # fmt: skip
+    """(count, P) specimens of a box from the prior with these parameters free; `TOGETHER` in turn
+    have the same refractive indices, so that they can be solved together."""
+    drawn = state_vector(names, lower, upper, free).prior_draws(key, count)
+    alike = of_indices(names)
     first = np.arange(count) // TOGETHER * TOGETHER
     drawn[:, alike] = drawn[first][:, alike]
     return drawn
@@ -143,10 +155,9 @@ def _check(
 
     key = jax.random.fold_in(jax.random.key(seed), 1)
     member = surrogate.at(surrogate.forms[0])
+    box = member.names, member.lower, member.upper
     part = checks // 2  # the same for each form
-    drawn = np.concatenate(
-        [fresh(member, checks - part, key), fresh(member, part, key, member.names)]
-    )
+    drawn = np.concatenate([fresh(*box, checks - part, key), fresh(*box, part, key, member.names)])
     found = {}
     total = checks * len(surrogate.forms)
     with (
@@ -279,8 +290,7 @@ def learn_locally(
     light from inside, plus `FLOOR`, as a share of what entered. `bar` counts the stages; `steps`
     of the optimiser, `LOCAL_STEPS` if None.
     """
-    forms = str(table["form"].attrs["flag_meanings"]).split()
-    mine = table["form"].values == forms.index(form)
+    mine = table["form"].values == forms_of(table).index(form)
     axes = tuple(str(name) for name in table["parameter"].values)
     rows = table["design"].values[mine]
     at = surface_share(rows, axes)[:, None]
@@ -329,11 +339,6 @@ def _fits(
     progress: bool,
 ) -> dict[str, dict[str, np.ndarray]]:  # fmt: skip
     """By form: every number of the fitted pipeline by name."""
-    import warnings
-
-    import scipy.linalg  # noqa: F401  # its own BLAS, to be limited too
-    from sklearn.exceptions import ConvergenceWarning
-    from threadpoolctl import threadpool_limits
     from tqdm import tqdm
 
     spreads = dict(zip(table["parameter"].values, table["spread"].values, strict=True))
@@ -342,11 +347,9 @@ def _fits(
         tqdm(
             total=2 * len(forms) * len(RATES), desc="train", unit="stage", disable=not progress
         ) as bar,
-        warnings.catch_warnings(),
-        threadpool_limits(1),
+        quietly(),
         ThreadPoolExecutor(THREADS) as pool,
     ):
-        warnings.simplefilter("ignore", ConvergenceWarning)  # the epochs are fixed beforehand
 
         def one(form: str) -> dict[str, np.ndarray]:
             log = learn_locally(table, form, seed, bar)(tuple(box), specimens)
@@ -354,6 +357,19 @@ def _fits(
             return _fit(np.asarray(x, float), log, seed, bar)
 
         return dict(zip(forms, pool.map(one, forms), strict=True))
+
+
+@contextmanager
+def quietly() -> Iterator[None]:
+    """What `learn_locally` wants around it: one thread of linear algebra for each regression, and
+    no word of epochs that end as they were set to. Outside the threads, which share both."""
+    import warnings
+
+    from sklearn.exceptions import ConvergenceWarning
+
+    with one_blas_thread(), warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        yield
 
 
 def _specimens(
@@ -391,9 +407,6 @@ def _network(
     The penalty is that of the most probable weights, where they have variance 1/width and each
     target has noise of this variance.
     """
-    import warnings
-
-    from sklearn.exceptions import ConvergenceWarning
     from sklearn.neural_network import MLPRegressor
 
     lot: Any = min(batch, len(x))
@@ -405,9 +418,7 @@ def _network(
     for rate, share in RATES:
         epochs = max(round(share * steps * lot / len(x)), 1)
         network.set_params(learning_rate_init=rate, max_iter=epochs)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # epochs are fixed beforehand
-            network.fit(x, y)
+        network.fit(x, y)
         if bar is not None:
             bar.update()
     return network
