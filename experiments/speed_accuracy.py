@@ -13,14 +13,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import _shared
+from experiments import _fresh, _shared
 from hylios_fit import adding, fresnel, skin, streams, table
 from hylios_fit.simulation import simulate
 from hylios_fit.skin import SPECS, Layers, Specimen
@@ -280,14 +279,6 @@ REGRESSIONS = {
 }
 
 
-def noise_free_table(path: Path | None = None) -> Any:
-    """Rows by adding-doubling; made if they are not there, which takes half an hour."""
-    path = path or _shared.CACHE / "adding.zarr"
-    if not path.exists():
-        table.generate(path, TABLE_ROWS, generator="adding")
-    return table.read_table(path, least_rows=1024)
-
-
 def truncated(surrogate: Any, count: int) -> Any:
     """The surrogate with the first `count` of its components."""
     import dataclasses
@@ -496,7 +487,7 @@ def _measured_rows(function: Callable[..., Any], names: Any, seed: int, truth: A
 
 
 def _from_table(base: Any, seed: int, path: str | None, truth: Any, methods: list) -> dict:
-    data = noise_free_table(Path(path) if path else None)
+    data = table.read_table(path) if path else _fresh.training_table("adding", TABLE_ROWS)
     data = data.isel(row=slice(0, TABLE_ROWS))
     grid = data["wavelength_nm"].values
     parts = _Parts((*TRANSPORT, "table", "surrogate"), **base, rows=int(data.sizes["row"]))

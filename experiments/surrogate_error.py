@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
 
-from experiments import _shared
+from experiments import _fresh, _shared
 from hylios_fit import adding, training
 from hylios_fit.appearance import appearances, colour_differences
 from hylios_fit.skin import Specimen
@@ -46,23 +44,13 @@ def run(
             key = jax.random.fold_in(jax.random.key(seed), 100 + number)
             free = ("usual",) if kind == "usual" else member.names
             rows = training.fresh(member.names, member.lower, member.upper, each, key, free)
-            truth = _solved(member.names, form, rows, progress)
+            truth = _fresh.solved(member.names, form, rows, progress)
             parts[form] = np.asarray(member(rows.astype(np.float32)), float), truth
         told = {form: _errors(nm, *pair) for form, pair in parts.items()}
         every = [np.concatenate(part) for part in zip(*parts.values(), strict=True)]
         found["kinds"][kind] = {"both": _errors(nm, *every), **told}
     found["slopes"] = {form: _slopes(surrogate, form, slopes, seed) for form in surrogate.forms}
     return found
-
-
-def _solved(names: tuple[str, ...], form: str, rows: np.ndarray, progress: bool) -> np.ndarray:
-    from tqdm import tqdm
-
-    lots = [rows[i : i + training.TOGETHER] for i in range(0, len(rows), training.TOGETHER)]
-    with ThreadPoolExecutor(training.THREADS) as pool:
-        solved = pool.map(partial(training.solve, names, form), lots)
-        bar = tqdm(solved, total=len(lots), desc=form, disable=not progress)
-        return np.concatenate(list(bar))
 
 
 def _errors(nm: np.ndarray, found: np.ndarray, truth: np.ndarray) -> dict[str, Any]:

@@ -75,7 +75,7 @@ def features(
     for layer in STRATA:
         scale = melanosome.SHRINKING[layer]
         attenuation = melanosome.attenuation_per_content(form, scale)
-        lost = -jnp.expm1(-DETOUR / attenuation * melanin)  # at a hit, about
+        lost = 1.0 - jnp.exp(-DETOUR / attenuation * melanin)  # at a hit, about; faster than expm1
         mu_a[layer] = mu_a[layer] + v[f"melanosome_{layer}"] / 100 * attenuation * lost
     depths = {layer: mu * v[f"thickness_{layer}"] for layer, mu in mu_a.items()}
     epidermis = sum(depths[layer] for layer in LAYERS[:4])

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 FORMAT = "hylios_fit table"
 FORMAT_VERSION = 2
 ROWS = 16_384
-RAYS = 8192  # of each set of paths
+RAYS = 16_384  # of each set of paths
 SHARE = 8  # rows that one set of paths serves
 GROUPS = 8  # sets of paths of one melanosome form that walk together
 GENERATORS = ("walker", "adding")
@@ -208,14 +208,19 @@ def walk_rows(
     groups = parameters.reshape(-1, SHARE, parameters.shape[-1])
     if not (groups[..., PATHS] == groups[:, :1, PATHS]).all():
         raise HyliosError(f"each {SHARE} rows must agree in what changes paths")
-    least = groups.min(axis=1)
-    for name in ("oxygen_saturation", "bottom_reflectance"):  # absorbs neither more nor less
-        place = NAMES.index(name)
-        least[:, place] = groups[..., place].mean(axis=1)
-    coefficients = layers_of(NAMES, form, stand=False)
-    walked, asked = coefficients(least), coefficients(parameters)
-    # groups in turn, so that long and short rays share the lanes
+    asked = layers_of(NAMES, form, stand=False)(parameters)
     count = len(groups)
+
+    def grouped(part: jax.Array) -> jax.Array:
+        return part.reshape(count, SHARE, *part.shape[1:])
+
+    # of each wavelength what loses least, layer by layer: no row's weights grow along a path
+    walked = jax.tree.map(lambda part: grouped(part)[:, 0], asked)._replace(
+        mu_a=grouped(asked.mu_a).min(axis=1),
+        hit_albedo=grouped(asked.hit_albedo).max(axis=1),
+        bottom=grouped(asked.bottom).max(axis=1),
+    )
+    # groups in turn, so that long and short rays share the lanes
     bits = jax.random.bits(key, (count,), jnp.uint32)
     shares = walker.hero_shares(walked.theta_0[0])
     own = np.stack([walker.spread(shares, b[None], 0, rays) for b in bits], axis=1)

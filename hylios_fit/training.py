@@ -2,8 +2,8 @@
 
 A wavelength knows of a specimen only what its layers absorb and scatter there: some twenty numbers.
 So the table is first learned as a function of those, all wavelengths of all rows together, which
-makes millions of examples of it (`_learn_locally`). That function then answers for as many more
-specimens as the regression on the principal components (`_fit`) needs, at the cost of a product of
+makes millions of examples of it (`learn_locally`). That function then answers for as many more
+specimens as the regression on the principal components (`fit`) needs, at the cost of a product of
 matrices each, and for parameters that act through the layers alone whether or not the table has an
 axis for them (`index_dispersion`).
 """
@@ -49,14 +49,16 @@ from hylios_fit.threads import one_blas_thread
 FURTHER = {"index_dispersion": (-0.005, 0.035)}
 """Ranges of parameters that the table has no axis for and its indices cover."""
 LOCAL_HIDDEN = (128, 128, 128)
-LOCAL_STEPS = 400_000
+LOCAL_STEPS = 500_000
 LOCAL_BATCH = 256
+TRUST = 1e-3  # error of the logarithm that noise-free rows are learned to, about
 SPECIMENS = 131_072  # of each form, that the local regression answers for
 COMPONENTS = 80
-HIDDEN = (192, 192)
-STEPS = 400_000
-BATCH = 128
+HIDDEN = (256, 128, 128)
+STEPS = 300_000
+BATCH = 256
 RATES = tuple((3e-3 * 0.5**k, 1 / 9) for k in range(9))  # and the share of the steps
+FAINTEST = 1e-3  # variance of what the inputs say beyond each other, below which it counts less
 LEAST_ROWS = 64  # of each form
 CHECK_ORDER = 8  # of the solver that they are held against
 TOGETHER = 16  # of them have the same refractive indices
@@ -84,12 +86,7 @@ def train(
     table = read_table(table_path, LEAST_ROWS)
     forms = tuple(forms_of(table))
     nm = table["wavelength_nm"].values
-    box = {
-        str(name): (float(low), float(high))
-        for name, low, high in zip(
-            table["parameter"].values, table["lower"].values, table["upper"].values, strict=True
-        )
-    } | FURTHER
+    box = box_of(table)
     names = tuple(box)
     curve = fresnel.surface_curve(
         float(np.radians(table.attrs["incidence_deg"])), Specimen().roughness
@@ -100,7 +97,7 @@ def train(
         "upper": np.array([high for _, high in box.values()]),
         "fresnel": curve.convert(domain=(0.5, 2.5)).coef,
     }
-    for form, fitted in _fits(table, box, forms, seed, progress).items():
+    for form, fitted in _fits(table, forms, seed, progress).items():
         parts = {**fitted, "modes": np.zeros((1, nm.size)), "rest": np.zeros(nm.size)}
         arrays.update({f"{form}/{name}": a.astype(np.float32) for name, a in parts.items()})
 
@@ -131,6 +128,14 @@ def train(
         about["regions"][form] = _regions(names, drawn, error)
     path = save(out_path, arrays, about)
     return check_report(load_surrogate(path))
+
+
+def box_of(table: Any) -> dict[str, tuple[float, float]]:
+    """Range of every parameter that can be learned from a table."""
+    parts = (table[name].values for name in ("parameter", "lower", "upper"))
+    return {
+        str(name): (float(low), float(high)) for name, low, high in zip(*parts, strict=True)
+    } | FURTHER
 
 
 def fresh(
@@ -302,11 +307,13 @@ def learn_locally(
     centre, scale = x.mean(axis=0), x.std(axis=0) + 1e-6
     middle, unit = float(log.mean()), float(log.std())
     y = ((log - middle) / unit).astype(np.float32).reshape(-1)
-    variance = float(noise.mean()) / unit**2
+    weight = (1.0 / (noise + TRUST**2)).reshape(-1)
+    variance = 1.0 / float(weight.mean()) / unit**2
+    weight /= weight.mean()
     x -= centre
     x /= scale
     steps = steps or LOCAL_STEPS
-    network = _network(x, y, LOCAL_HIDDEN, steps, LOCAL_BATCH, variance, seed, bar)
+    network = _network(x, y, LOCAL_HIDDEN, steps, LOCAL_BATCH, variance, seed, bar, weight)
     weights = [jnp.asarray(w, jnp.float32) for w in network.coefs_]
     biases = [jnp.asarray(b, jnp.float32) for b in network.intercepts_]
 
@@ -335,14 +342,12 @@ def _lots(rows: np.ndarray, size: int = 64) -> list[Array]:
 
 
 def _fits(
-    table: Any, box: dict[str, tuple[float, float]], forms: tuple[str, ...], seed: int,
-    progress: bool,
-) -> dict[str, dict[str, np.ndarray]]:  # fmt: skip
+    table: Any, forms: tuple[str, ...], seed: int, progress: bool
+) -> dict[str, dict[str, np.ndarray]]:
     """By form: every number of the fitted pipeline by name."""
     from tqdm import tqdm
 
-    spreads = dict(zip(table["parameter"].values, table["spread"].values, strict=True))
-    specimens = _specimens(box, spreads, seed)
+    names, asked = tuple(box_of(table)), specimens(table, seed)
     with (
         tqdm(
             total=2 * len(forms) * len(RATES), desc="train", unit="stage", disable=not progress
@@ -352,9 +357,9 @@ def _fits(
     ):
 
         def one(form: str) -> dict[str, np.ndarray]:
-            log = learn_locally(table, form, seed, bar)(tuple(box), specimens)
-            x = features(tuple(box), form, jnp.asarray(specimens, jnp.float32))
-            return _fit(np.asarray(x, float), log, seed, bar)
+            log = learn_locally(table, form, seed, bar)(names, asked)
+            x = features(names, form, jnp.asarray(asked, jnp.float32))
+            return fit(np.asarray(x, float), log, seed, bar)
 
         return dict(zip(forms, pool.map(one, forms), strict=True))
 
@@ -372,14 +377,16 @@ def quietly() -> Iterator[None]:
         yield
 
 
-def _specimens(
-    box: dict[str, tuple[float, float]], spreads: dict[str, str], seed: int
-) -> np.ndarray:
-    """(SPECIMENS, P): a fifth spread over the box as the table is, the rest from the prior, half
-    of it with the usual parameters free and half with all."""
+def specimens(table: Any, seed: int, count: int | None = None) -> np.ndarray:
+    """(count, P), by default `SPECIMENS`, that the second regression learns from: a tenth spread
+    over the box as the table is, the rest from the prior, four tenths with the usual parameters
+    free and half with all."""
     from scipy.stats import qmc
 
-    part = SPECIMENS // 5
+    box = box_of(table)
+    spreads = dict(zip(table["parameter"].values, table["spread"].values, strict=True))
+    count = count or SPECIMENS
+    part = count // 10
     sobol = qmc.Sobol(len(box), rng=np.random.default_rng([seed, 2]))
     unit = sobol.random(1 << math.ceil(math.log2(part)))[:part]
     over = [
@@ -387,25 +394,23 @@ def _specimens(
         for u, (name, (low, high)) in zip(unit.T, box.items(), strict=True)
     ]
     names, (lower, upper) = tuple(box), np.array(list(box.values())).T
-    drawn = [
+    prior = [
         state_vector(names, lower, upper, free).prior_draws(
-            jax.random.fold_in(jax.random.key(seed), 2 + number), count
+            jax.random.fold_in(jax.random.key(seed), 2 + number), drawn
         )
-        for number, (free, count) in enumerate(
-            ((("usual",), 2 * part), (names, SPECIMENS - 3 * part))
-        )
+        for number, (free, drawn) in enumerate(((("usual",), 4 * part), (names, count - 5 * part)))
     ]
-    return np.concatenate([np.stack(over, axis=1), *drawn])
+    return np.concatenate([np.stack(over, axis=1), *prior])
 
 
 def _network(
     x: np.ndarray, y: np.ndarray, hidden: tuple[int, ...], steps: int, batch: int,
-    variance: float, seed: int, bar: Any,
+    variance: float, seed: int, bar: Any, weight: np.ndarray | None = None,
 ) -> Any:  # fmt: skip
     """A perceptron of about `steps` batches.
 
     The penalty is that of the most probable weights, where they have variance 1/width and each
-    target has noise of this variance.
+    target has noise of this variance, or of this variance over its `weight`.
     """
     from sklearn.neural_network import MLPRegressor
 
@@ -418,26 +423,47 @@ def _network(
     for rate, share in RATES:
         epochs = max(round(share * steps * lot / len(x)), 1)
         network.set_params(learning_rate_init=rate, max_iter=epochs)
-        network.fit(x, y)
+        network.fit(x, y, weight)
         if bar is not None:
             bar.update()
     return network
 
 
-def _fit(x: np.ndarray, log: np.ndarray, seed: int, bar: Any) -> dict[str, np.ndarray]:
-    """Standardise, reduce, regress: features (n, f), and what they give (n, w)."""
+def _decorrelating(x: np.ndarray, faintest: float) -> np.ndarray:
+    """(f, f): standardised inputs (n, f) times this have no correlations, and variances of 1 but
+    where they were below `faintest`. Inputs that nearly repeat each other are learned slowly: in
+    as many steps the error was a third larger without."""
+    size, vectors = np.linalg.eigh(np.cov(x.T))
+    size = np.maximum(size, 0.0)
+    return vectors * np.sqrt((1.0 + faintest) / (size + faintest))
+
+
+def fit(
+    x: np.ndarray, log: np.ndarray, seed: int = 0, bar: Any = None,
+    hidden: tuple[int, ...] | None = None, steps: int | None = None, faintest: float = FAINTEST,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """Standardise, reduce, regress: features (n, f), and what they give (n, w).
+
+    A perceptron of `HIDDEN` units and `STEPS` unless told otherwise. Returns every number of what
+    the surrogate evaluates, by name.
+    """
     from sklearn.decomposition import PCA
     from sklearn.preprocessing import StandardScaler
 
     scaler: Any = StandardScaler().fit(x)
+    # in single precision the components beyond 3e-4 of the first were noise, and cost 4e-4
+    log = log.astype(float)
     pca: Any = PCA(min(COMPONENTS, len(x) // 4), random_state=seed).fit(log)
     scores = pca.transform(log)
     unit = scores[:, 0].std()  # one scale for all, so that what matters more weighs more
-    inputs = scaler.transform(x).astype(np.float32)
+    inputs = scaler.transform(x)
+    apart = _decorrelating(inputs, faintest)
+    inputs = (inputs @ apart).astype(np.float32)
     targets = (scores / unit).astype(np.float32)
-    network = _network(inputs, targets, HIDDEN, STEPS, BATCH, 0.0, seed, bar)
+    network = _network(inputs, targets, hidden or HIDDEN, steps or STEPS, BATCH, 0.0, seed, bar)
     weights = [np.asarray(w, float) for w in network.coefs_]
     biases = [np.asarray(b, float) for b in network.intercepts_]
+    weights[0] = apart @ weights[0]
     weights[-1], biases[-1] = weights[-1] * unit, biases[-1] * unit
     return {
         "centre": scaler.mean_,

@@ -13,7 +13,7 @@ import pytest
 
 from hylios_fit import table
 from hylios_fit.errors import HyliosError
-from hylios_fit.skin import SPECS
+from hylios_fit.skin import SPECS, Specimen
 
 RAYS = 256
 ROWS = 24
@@ -191,6 +191,16 @@ def test_rows_of_a_group_share_paths_and_agree_with_their_own_walk(small):
     assert np.sqrt(np.mean(z**2)) < 2
     with pytest.raises(HyliosError, match="must agree in what changes paths"):
         table.walk_rows(parameters[form == 0][2:6], "complex", jax.random.key(3), 256)
+
+
+def test_no_row_of_a_group_weighs_without_bound(small):
+    # dark bottoms beside a white one, which light meets again and again
+    rows = [
+        Specimen().replace(bottom_reflectance=r).parameters(table.NAMES) for r in (0, 0.1, 0.2, 1)
+    ]
+    _, shared = table.walk_rows(np.array(rows), "complex", jax.random.key(3), 1024)
+    _, alone = table.walk_rows(np.array(rows[-1:] * 4), "complex", jax.random.key(3), 1024)
+    assert shared[-1].max() < 1.5 * alone[-1].max()
 
 
 def empty(path):

@@ -1,0 +1,167 @@
+"""Which regression on how many principal components: error against cost."""
+
+from __future__ import annotations
+
+import itertools
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import _fresh, _shared
+from hylios_fit import training
+from hylios_fit.surrogate import features
+
+FORM = "complex"
+LOCAL_STEPS = 160_000
+STEPS = 60_000
+SPECIMENS = 65_536
+FRESH = 128  # of each kind
+PERCEPTRONS = ((64, 64), (128, 128), (192, 192), (192, 128, 128), (256, 128, 128), (384, 192, 192))
+COMPONENTS = (5, 10, 20, 40, 60, 80)
+BANDS = 3
+MODULES = ("training", "table", "surrogate", "skin", "adding", "streams", "statevector")
+CORRELATED = 1e9  # for `training.fit`: inputs are turned, not scaled
+
+
+def run(
+    seed: int = 0,
+    data: Any = None,
+    local_steps: int = LOCAL_STEPS,
+    steps: int = STEPS,
+    specimens: int = SPECIMENS,
+    fresh: int = FRESH,
+    perceptrons: tuple[tuple[int, ...], ...] = PERCEPTRONS,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """The training of the embedded surrogate with fewer steps and specimens, of one form, and with
+    other regressions; held against the solver on specimens that none has seen."""
+    from tqdm import tqdm
+
+    if data is None:
+        data = _fresh.training_table("adding", _fresh.ROWS, progress=progress)
+    names = tuple(training.box_of(data))
+    key = jax.random.fold_in(jax.random.key(seed), 400)
+    settings = {"local_steps": local_steps, "specimens": specimens, "rows": int(data.sizes["row"])}
+    folder = _shared.checkpoint("surrogate_choice", MODULES, seed=seed, fresh=fresh, **settings)
+    held = {}
+    for number, (kind, free) in enumerate((("usual", ("usual",)), ("every", names))):
+        path = folder / f"{kind}.npz"
+        if not path.exists():
+            own = jax.random.fold_in(key, number)
+            found = _fresh.specimens(data, FORM, fresh, own, free, progress)
+            _shared.save_arrays(path, **found._asdict())
+        held[kind] = _fresh.Fresh(**_shared.load_arrays(path))
+    drawn = training.specimens(data, seed, specimens)
+    path = folder / "answers.npz"
+    if not path.exists():
+        print("local regression", flush=True)
+        with training.quietly():
+            local = training.learn_locally(data, FORM, seed, steps=local_steps)
+        every = {kind: local(names, part.rows) for kind, part in held.items()}
+        _shared.save_arrays(path, drawn=local(names, drawn), **every)
+    log = _shared.load_arrays(path)
+
+    def seen(rows: np.ndarray) -> np.ndarray:
+        return np.asarray(features(names, FORM, jnp.asarray(rows, jnp.float32)), float)
+
+    def rms(answers: dict[str, np.ndarray]) -> dict[str, float]:
+        errors = {kind: part.errors(answers[kind]) for kind, part in held.items()}
+        return {k: _shared.significant(np.sqrt(np.mean(e**2)), 3) for k, e in errors.items()}
+
+    x, asked = seen(drawn), {kind: seen(part.rows) for kind, part in held.items()}
+
+    def perceptron(job: tuple[tuple[int, ...], float]) -> dict[str, Any]:
+        hidden, faintest = job
+        fitted = training.fit(x, log["drawn"], seed, None, hidden, steps, faintest)
+        widths = (x.shape[1], *hidden, BANDS)
+        return {
+            "hidden": list(hidden),
+            "decorrelated": faintest < 1.0,
+            "products": sum(a * b for a, b in itertools.pairwise(widths)),
+            "rms": rms({kind: _perceptron(fitted, part) for kind, part in asked.items()}),
+        }
+
+    jobs = [(hidden, training.FAINTEST) for hidden in perceptrons]
+    jobs.append((training.HIDDEN, CORRELATED))
+    with training.quietly(), ThreadPoolExecutor(training.THREADS) as pool:
+        made = pool.map(perceptron, jobs[::-1])  # the largest first
+        made = list(tqdm(made, total=len(jobs), unit="perceptron", disable=not progress))[::-1]
+    return {
+        "form": FORM, **settings, "steps": steps, "fresh": fresh, "bands": BANDS,
+        "chosen": list(training.HIDDEN), "components": training.COMPONENTS,
+        "local": rms(log),
+        "perceptrons": made,
+        "ridge": [_ridge(x, log["drawn"], asked, degree, rms) for degree in (1, 2)],
+        "truncated": _truncated(log["drawn"]),
+    }  # fmt: skip
+
+
+def _perceptron(fitted: dict[str, np.ndarray], x: np.ndarray) -> np.ndarray:
+    x = (x - fitted["centre"]) / fitted["scale"]
+    layers = sum(name.startswith("weight") for name in fitted)
+    for i in range(layers):
+        x = x @ fitted[f"weight{i}"] + fitted[f"bias{i}"]
+        x = np.tanh(x) if i < layers - 1 else x
+    return x @ fitted["components"] + fitted["mean"]
+
+
+def _ridge(x: Any, log: np.ndarray, asked: Any, degree: int, rms: Any) -> dict[str, Any]:
+    from sklearn.linear_model import Ridge
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+
+    model = make_pipeline(StandardScaler(), PolynomialFeatures(degree), Ridge(1.0))
+    model.fit(x.astype(np.float32), log)
+    terms = int(model.named_steps["polynomialfeatures"].n_output_features_)
+    answers = {kind: model.predict(part.astype(np.float32)) for kind, part in asked.items()}
+    return {"degree": degree, "products": terms * (1 + BANDS), "rms": rms(answers)}
+
+
+def _truncated(log: np.ndarray) -> list[dict[str, float]]:
+    """What so many components leave out of the prior's spectra, in reflectance."""
+    from sklearn.decomposition import PCA
+
+    pca: Any = PCA(max(COMPONENTS), random_state=0).fit(log.astype(float))
+    last = log[-4096:]
+    scores = pca.transform(last.astype(float))
+    found = []
+    for count in COMPONENTS:
+        back = scores[:, :count] @ pca.components_[:count] + pca.mean_
+        error = np.sqrt(np.mean((np.exp(back) - np.exp(last)) ** 2))
+        found.append({"components": count, "rms": _shared.significant(error, 3)})
+    return found
+
+
+def draw(result: dict[str, Any], path: Any) -> None:
+    """Error against products, and against components."""
+    figure = _shared.figure(10, 4.4)
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    labels = {"usual": "pigments, blood, water, lipids free", "every": "every parameter free"}
+    for (kind, label), colour in zip(labels.items(), _shared.COLOURS, strict=False):
+        for name, marker in (("perceptrons", "o"), ("ridge", "^")):
+            points = [p for p in result[name] if p.get("decorrelated", True)]
+            left.plot(
+                [p["products"] for p in points], [p["rms"][kind] for p in points], marker,
+                color=colour, label=f"{name[:10].rstrip('s')}, {label}",
+            )  # fmt: skip
+        for point in result["perceptrons"]:
+            at = point["products"], point["rms"][kind]
+            if not point["decorrelated"]:
+                left.plot(*at, "x", color=colour, label="its inputs not decorrelated")
+            elif kind == "every":
+                text = " x ".join(map(str, point["hidden"]))
+                left.annotate(text, at, (0, 6), textcoords="offset points", fontsize=7, ha="center")
+        left.axhline(result["local"][kind], color=colour, ls=":", lw=1)
+    _shared.logarithmic(left.xaxis)
+    left.set_yscale("log")
+    left.legend(fontsize=7)
+    title = "dotted: what they learned from"
+    _shared.tidy(left, "products for three bands", "RMS error of the reflectance", title)
+    points = result["truncated"]
+    right.plot([p["components"] for p in points], [p["rms"] for p in points], "o-", ms=4)
+    right.set_yscale("log")
+    _shared.tidy(right, "principal components", "RMS error of the reflectance by what is left out")
+    _shared.save_figure(figure, path)
