@@ -139,15 +139,25 @@ def fit_many(
         return [_fit_one(job, spectra, i) for i in order]
 
 
+class Reported(eqx.Module):
+    """A surrogate's member as the instrument reports it: (P,) parameters -> (B,) reflectance."""
+
+    member: Any
+    specular: str = eqx.field(static=True)
+
+    def __call__(self, parameters: Float[Array, " P"]) -> Float[Array, " B"]:
+        surface = self.member.surface_at(parameters)
+        return self.member(parameters) + instrument.specular_offset(surface, self.specular)
+
+
 @dataclass(frozen=True)
 class Model:
     """One form of the melanosomes on the instrument's bands, with its scan of the prior."""
 
     form: str
-    member: Any
-    """(P,) parameters -> (B,) reflectance, a pytree."""
-    offset: float
-    """Reflectance to add: minus the surface's where the measurement excludes it, else 0."""
+    member: Reported
+    unseen: Any
+    """What the surface reflects, (B,) or 0, where the measurement excludes it."""
     scan: np.ndarray
     """(SCAN, B) spectra of the scan's states."""
 
@@ -193,10 +203,11 @@ def _job(
     models, error = [], {}
     for form in forms if usable.any() else ():
         projected = surrogate.at(form).on(wavelength[usable])
-        member = as_float64(projected)
-        offset = instrument.specular_offset(projected.surface_at(vector.held), specular)
-        scan = np.asarray(_spectra(member, vector, jnp.asarray(states))) + offset
-        models.append(Model(form, member, offset, scan))
+        member = Reported(as_float64(projected), specular)
+        held = projected.surface_at(vector.held)
+        unseen = -np.asarray(instrument.specular_offset(held, specular), float)
+        scan = np.asarray(_spectra(member, vector, jnp.asarray(states)))
+        models.append(Model(form, member, unseen, scan))
         error[form] = projected.error_covariance
     settings = {
         "noise": noise_text,
@@ -452,17 +463,17 @@ def _search(
         starts = job.states[np.argsort(score, kind="stable")[: job.starts]]
     else:
         starts = start[None]
-    shifted, weights_on = jnp.asarray(filled - model.offset), jnp.asarray(weights)
+    filled, weights_on = jnp.asarray(filled), jnp.asarray(weights)
     best, total = None, 0
     for one in starts:
-        found = _solve(model.member, job.vector, weights_on, shifted, jnp.asarray(one))
+        found = _solve(model.member, job.vector, weights_on, filled, jnp.asarray(one))
         z, objective, jacobian, spectrum, gradient, steps = jax.device_get(found)
         total += int(steps)
         if np.isfinite(objective) and (best is None or objective < best.objective):
             # Distance to the minimum in posterior standard deviations, whatever stopped the search.
             distance = np.sqrt(max(gradient @ _s_hat(jacobian) @ gradient, 0.0))
             best = _Solution(
-                model, z, float(objective), jacobian, spectrum + model.offset,
+                model, z, float(objective), jacobian, spectrum,
                 bool(distance < CONVERGED_WITHIN), 0, covariance, weights, log_determinant,
             )  # fmt: skip
     if best is None:
@@ -506,7 +517,7 @@ def _inverted(job: _Job, wavelength_nm: np.ndarray, measured: np.ndarray, name: 
 def _stated(job: _Job, noise: np.ndarray, level: np.ndarray) -> dict[str, np.ndarray]:
     """S_eps by form: the noise and the surrogate's own error at a reflectance."""
     return {
-        model.form: noise + job.surrogate_error[model.form](level[job.usable] - model.offset)
+        model.form: noise + job.surrogate_error[model.form](level[job.usable] + model.unseen)
         for model in job.models
     }
 

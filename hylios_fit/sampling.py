@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hylios_fit import instrument, inversion, statevector
+from hylios_fit import inversion, statevector
 from hylios_fit.errors import HyliosError
 from hylios_fit.results import QUANTITIES, Fit, Posterior
 from hylios_fit.threads import one_blas_thread
@@ -103,13 +103,13 @@ def log_posterior(
     fixed = {k: v for k, v in fit.settings.get("fix", {}).items() if k != "melanosome_form"}
     vector = statevector.state_vector(whole.names, whole.lower, whole.upper, fit.names, fixed)
     used = np.isfinite(np.diag(fit.error_covariance))
-    member = inversion.as_float64(whole.on(fit.wavelength_nm[used]))
+    specular = fit.settings.get("specular", "included")
+    projected = whole.on(fit.wavelength_nm[used])
+    member = inversion.Reported(inversion.as_float64(projected), specular)
     covariance = np.asarray(fit.error_covariance)[np.ix_(used, used)]
     weights, _ = inversion.whitener(covariance, np.ones(int(used.sum()), dtype=bool))
-    specular = fit.settings.get("specular", "included")
-    offset = instrument.specular_offset(member.surface_at(vector.held), specular)
-    shifted = jnp.asarray(fit.measured[used] - offset)
-    arguments = jax.tree.map(_as_array, (member, vector, jnp.asarray(weights), shifted))
+    measured = jnp.asarray(fit.measured[used])
+    arguments = jax.tree.map(_as_array, (member, vector, jnp.asarray(weights), measured))
     dynamic, static = eqx.partition(arguments, eqx.is_array)
     compiled = _log_posterior(static)
 

@@ -11,7 +11,9 @@ from hylios_fit import inversion, statevector
 from hylios_fit.errors import HyliosError
 from hylios_fit.instrument import noise_covariance
 from hylios_fit.results import QUANTITIES, Estimate, Fit, Outcome
+from hylios_fit.skin import Specimen
 from hylios_fit.spectra import Spectra
+from hylios_fit.surrogate import load_surrogate
 
 TOY = ToySurrogate()
 VISIBLE = np.arange(400.0, 701.0, 10.0)
@@ -334,6 +336,24 @@ def test_what_is_no_skin_is_outside_the_range(values):
     fit = one(values)
     assert fit.outcome is Outcome.outside_range
     assert not fit.outcome.is_fitted
+
+
+def test_the_surface_that_is_excluded_is_that_of_the_index_that_is_fitted():
+    surrogate = load_surrogate()
+    truth = Specimen().replace(index_corneum=1.47)
+    bands = np.arange(400.0, 701.0, 20.0)
+    member = surrogate.at("complex").on(bands)
+    own = truth.parameters(member.names).astype(np.float32)
+    values = np.asarray(member(own) - member.surface_at(own), float)
+    free = ("usual", "index_corneum")
+    found = inversion.fit(
+        (bands, values), surrogate, noise=0.002, free=free, specular="excluded",
+        fix={"melanosome_form": "complex"},
+    )  # fmt: skip
+    best = dict(zip(found.names, found.value, strict=True))
+    asked = truth.replace(**best).parameters(member.names).astype(np.float32)
+    expected = np.asarray(member(asked) - member.surface_at(asked))
+    np.testing.assert_allclose(found.fitted, expected, atol=1e-5)
 
 
 def test_specular_excluded_subtracts_the_surface():
