@@ -51,7 +51,7 @@ FURTHER = {"index_dispersion": (-0.005, 0.035)}
 LOCAL_HIDDEN = (128, 128, 128)
 LOCAL_STEPS = 500_000
 LOCAL_BATCH = 256
-TRUST = 1e-3  # error of the logarithm that noise-free rows are learned to, about
+TRUST = 1e-3  # error of the logarithm that rows without noise are learned to, about
 SPECIMENS = 131_072  # of each form, that the local regression answers for
 COMPONENTS = 80
 HIDDEN = (256, 128, 128)
@@ -307,9 +307,11 @@ def learn_locally(
     centre, scale = x.mean(axis=0), x.std(axis=0) + 1e-6
     middle, unit = float(log.mean()), float(log.std())
     y = ((log - middle) / unit).astype(np.float32).reshape(-1)
-    weight = (1.0 / (noise + TRUST**2)).reshape(-1)
-    variance = 1.0 / float(weight.mean()) / unit**2
-    weight /= weight.mean()
+    weight, variance = None, float(noise.mean()) / unit**2
+    if table.attrs["generator"] == "walker":  # the errors of `adding` are no noise
+        weight = (1.0 / (noise + TRUST**2)).reshape(-1)
+        variance = 1.0 / float(weight.mean()) / unit**2
+        weight /= weight.mean()
     x -= centre
     x /= scale
     steps = steps or LOCAL_STEPS
