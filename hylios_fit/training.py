@@ -36,6 +36,7 @@ from hylios_fit.surrogate import (
     save,
 )
 from hylios_fit.table import (
+    USUAL,
     forms_of,
     layers_of,
     of_indices,
@@ -381,8 +382,9 @@ def quietly() -> Iterator[None]:
 
 def specimens(table: Any, seed: int, count: int | None = None) -> np.ndarray:
     """(count, P), by default `SPECIMENS`, that the second regression learns from: a tenth spread
-    over the box as the table is, the rest from the prior, four tenths with the usual parameters
-    free and half with all."""
+    over the box as the table is, as many over the model as published, where the usual parameters
+    alone move, and the rest from the prior: three tenths with the usual parameters free, half with
+    all."""
     from scipy.stats import qmc
 
     box = box_of(table)
@@ -390,19 +392,21 @@ def specimens(table: Any, seed: int, count: int | None = None) -> np.ndarray:
     count = count or SPECIMENS
     part = count // 10
     sobol = qmc.Sobol(len(box), rng=np.random.default_rng([seed, 2]))
-    unit = sobol.random(1 << math.ceil(math.log2(part)))[:part]
-    over = [
+    unit = sobol.random(1 << math.ceil(math.log2(2 * part)))[: 2 * part]
+    columns = [
         spread(u, low, high, spreads.get(name, "linear"))
         for u, (name, (low, high)) in zip(unit.T, box.items(), strict=True)
     ]
+    over = np.stack(columns, axis=1)
+    over[part:, USUAL:] = Specimen().parameters(tuple(box))[USUAL:]
     names, (lower, upper) = tuple(box), np.array(list(box.values())).T
     prior = [
         state_vector(names, lower, upper, free).prior_draws(
             jax.random.fold_in(jax.random.key(seed), 2 + number), drawn
         )
-        for number, (free, drawn) in enumerate(((("usual",), 4 * part), (names, count - 5 * part)))
+        for number, (free, drawn) in enumerate(((("usual",), 3 * part), (names, count - 5 * part)))
     ]
-    return np.concatenate([np.stack(over, axis=1), *prior])
+    return np.concatenate([over, *prior])
 
 
 def _network(

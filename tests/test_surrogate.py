@@ -414,6 +414,36 @@ def test_training_ignores_unfinished_rows_and_says_when_too_few(tmp_path):
     assert not (tmp_path / "s.npz").exists()
 
 
+def test_what_is_learned_from_fills_the_box_the_published_model_and_the_prior():
+    rows = table._empty(128, 1, 0)
+    drawn = training.specimens(rows, 0, 1000)
+    lower, upper = np.array(list(training.box_of(rows).values())).T
+    assert drawn.shape == (1000, len(lower))
+    assert ((drawn >= lower) & (drawn <= upper)).all()
+    model = Specimen().parameters(tuple(training.box_of(rows)))
+    others = (drawn[:, table.USUAL :] == model[table.USUAL :]).all(axis=1)
+    assert np.flatnonzero(others).tolist() == list(range(100, 500))
+    # over the whole range of each, and not only where the prior is
+    share = (drawn[100:200] - lower)[:, : table.USUAL] / (upper - lower)[: table.USUAL]
+    assert (share.min(axis=0) < 0.05).all()
+    assert (share.max(axis=0) > 0.9).all()
+
+
+def test_inputs_that_repeat_each_other_are_told_apart():
+    rng = np.random.default_rng(0)
+    one = rng.normal(size=(5000, 1))
+    x = np.hstack([one, one + 0.1 * rng.normal(size=(5000, 1)), rng.normal(size=(5000, 1))])
+    x = (x - x.mean(axis=0)) / x.std(axis=0)
+    covariance = np.cov((x @ training._decorrelating(x, 1e-3)).T)
+    off = covariance - np.diag(np.diag(covariance))
+    np.testing.assert_allclose(off, 0.0, atol=1e-9)
+    size = np.linalg.eigvalsh(np.cov(x.T))
+    # all alike but for what is as faint as the limit
+    np.testing.assert_allclose(
+        np.sort(np.diag(covariance)), size * 1.001 / (size + 1e-3), rtol=1e-6
+    )
+
+
 def test_the_error_is_that_of_the_check_widened_for_its_size():
     rng = np.random.default_rng(0)
     own = rng.normal(size=(4000, 1)) * 0.01 * np.linspace(1, 2, 60)
