@@ -15,9 +15,9 @@ from hylios_fit import training
 from hylios_fit.surrogate import features
 
 FORM = "complex"
-LOCAL_STEPS = 160_000
-STEPS = 60_000
-SPECIMENS = 65_536
+LOCAL_STEPS = 100_000
+STEPS = 30_000
+SPECIMENS = 32_768
 FRESH = 128  # of each kind
 PERCEPTRONS = ((64, 64), (128, 128), (192, 192), (192, 128, 128), (256, 128, 128), (384, 192, 192))
 COMPONENTS = (5, 10, 20, 40, 60, 80)

@@ -17,7 +17,7 @@ from experiments import _fresh, _shared
 from hylios_fit import table, training
 
 ROWS = (1024, 4096, 16_384)
-STEPS = 100_000
+STEPS = 60_000
 FRESH = 128
 FORM = "complex"
 
