@@ -15,10 +15,10 @@ from hylios_fit import training
 from hylios_fit.surrogate import features
 
 FORM = "complex"
-LOCAL_STEPS = 100_000
-STEPS = 30_000
+LOCAL_STEPS = 60_000
+STEPS = 20_000
 SPECIMENS = 32_768
-FRESH = 128  # of each kind
+FRESH = 64  # of each kind
 PERCEPTRONS = ((64, 64), (128, 128), (192, 192), (192, 128, 128), (256, 128, 128), (384, 192, 192))
 COMPONENTS = (5, 10, 20, 40, 60, 80)
 BANDS = 3
