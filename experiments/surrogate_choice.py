@@ -151,12 +151,17 @@ def draw(result: dict[str, Any], path: Any) -> None:
             at = point["products"], point["rms"][kind]
             if not point["decorrelated"]:
                 left.plot(*at, "x", color=colour, label="its inputs not decorrelated")
-            elif kind == "every":
-                text = " x ".join(map(str, point["hidden"]))
-                left.annotate(text, at, (0, 6), textcoords="offset points", fontsize=7, ha="center")
+            elif kind == "usual":
+                left.annotate(
+                    "-".join(map(str, point["hidden"])), at,
+                    (-6 if len(point["hidden"]) == 2 else 2, -5), textcoords="offset points",
+                    fontsize=7, rotation=90, ha="center", va="top",
+                )  # fmt: skip
         left.axhline(result["local"][kind], color=colour, ls=":", lw=1)
     _shared.logarithmic(left.xaxis)
     left.set_yscale("log")
+    left.set_ylim(bottom=3.5e-4)
+    left.tick_params(axis="x", labelsize=8, rotation=30)
     left.legend(fontsize=7)
     title = "dotted: what they learned from"
     _shared.tidy(left, "products for three bands", "RMS error of the reflectance", title)
