@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +13,6 @@ from hylios_fit.surrogate import FLOOR
 
 SEED = 20150413
 """Of the tables, as of the one that the embedded surrogate was trained on."""
-ROWS = 16_384
 
 
 class Fresh(NamedTuple):
@@ -34,8 +31,7 @@ def specimens(
     data: Any, form: str, count: int, key: Any, free: tuple[str, ...], progress: bool = True
 ) -> Fresh:
     """Fresh specimens from the prior within a table's box."""
-    box = training.box_of(data)
-    names, (lower, upper) = tuple(box), np.array(list(box.values())).T
+    names, lower, upper = training.box_of(data)
     rows = training.fresh(names, lower, upper, count, key, free)
     index = np.asarray(table.layers_of(names, form)(rows).index[:, 0], float)
     curve = fresnel.surface_curve(float(np.radians(table.INCIDENCE_DEG)), Specimen().roughness)
@@ -46,17 +42,18 @@ def solved(names: tuple[str, ...], form: str, rows: np.ndarray, progress: bool) 
     """(n, w) by adding-doubling."""
     from tqdm import tqdm
 
-    lots = [rows[i : i + training.TOGETHER] for i in range(0, len(rows), training.TOGETHER)]
-    with ThreadPoolExecutor(training.THREADS) as pool:
-        found = pool.map(partial(training.solve, names, form), lots)
-        return np.concatenate(list(tqdm(found, total=len(lots), desc=form, disable=not progress)))
+    total = len(rows)
+    with tqdm(total=total, desc=form, unit="specimen", disable=not progress) as bar:
+        return training.solved(names, form, rows, bar)
 
 
 def training_table(generator: str, rows: int, folder: Any = None, progress: bool = True) -> Any:
     """A table of at least these rows; made, or made longer, if it is not there."""
     path = (folder or _shared.CACHE) / f"{generator}.zarr"
-    if not path.exists() or table.read_table(path).sizes["row"] < rows:
+    data = table.read_table(path) if path.exists() else None
+    if data is None or data.sizes["row"] < rows:
         table.generate(
             path, rows, seed=SEED, generator=generator, resume=path.exists(), progress=progress
         )
-    return table.read_table(path)
+        data = table.read_table(path)
+    return data

@@ -63,6 +63,13 @@ def kept(folder: Path, name: str, make: Callable[[], Any]) -> Any:
     return json.loads(path.read_text())
 
 
+def kept_arrays(path: Path, make: Callable[[], Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    """Arrays by name from an .npz file; made if it is not there."""
+    if not path.exists():
+        save_arrays(path, **make())
+    return load_arrays(path)
+
+
 def save_json(path: Path, content: Any) -> None:
     """Write a .json file whole or not at all."""
     partial = path.with_suffix(".partial")

@@ -99,9 +99,10 @@ def _fitted(
         for first in range(0, len(spectra), block):
             path = folder / f"{first:06d}.npz"
             chosen = range(first, min(first + block, len(spectra)))
-            if not path.exists():
-                _shared.save_arrays(path, **_block(spectra.select(chosen), surrogate, starts))
-            parts.append(_shared.load_arrays(path))
+            part = _shared.kept_arrays(
+                path, lambda chosen=chosen: _block(spectra.select(chosen), surrogate, starts)
+            )
+            parts.append(part)
             bar.update(len(chosen))
     table = {name: np.concatenate([part[name] for part in parts]) for name in COLUMNS}
     outcomes = np.concatenate([part["outcome"] for part in parts])

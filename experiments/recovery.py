@@ -66,12 +66,12 @@ def run(
     )  # fmt: skip
 
     def one(i: int) -> dict[str, np.ndarray]:
-        path = folder / f"{i:04d}.npz"
-        if not path.exists():
+        def make() -> dict[str, np.ndarray]:
             own = jax.random.fold_in(jax.random.fold_in(key, 1), i)
             reflectance, covariance = simulated(truths[i], forms[i], key=own)
-            _shared.save_arrays(path, reflectance=reflectance, covariance=covariance)
-        return _shared.load_arrays(path)
+            return {"reflectance": reflectance, "covariance": covariance}
+
+        return _shared.kept_arrays(folder / f"{i:04d}.npz", make)
 
     bar = partial(tqdm, total=specimens, unit="specimen", disable=not progress)
     with ThreadPoolExecutor(THREADS) as pool:

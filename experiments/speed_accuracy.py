@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -315,14 +315,12 @@ def core_time(call: Callable[[], Any], spectra: int, repeats: int = 7) -> dict[s
     return {"core_s": _shared.significant(core, 3), "wall_s": _shared.significant(wall, 3)}
 
 
-class _Parts:
-    """Parts of the run, each kept in a file once it is done."""
+Parts = Callable[[str, Callable[[], Any]], Any]
 
-    def __init__(self, modules: tuple[str, ...], **settings: Any):
-        self.folder = _shared.checkpoint("speed_accuracy", modules, **settings)
 
-    def __call__(self, name: str, make: Callable[[], Any]) -> Any:
-        return _shared.kept(self.folder, name, make)
+def _parts(modules: tuple[str, ...], **settings: Any) -> Parts:
+    """What keeps each part of the run in a file once it is done."""
+    return partial(_shared.kept, _shared.checkpoint("speed_accuracy", modules, **settings))
 
 
 def rms(found: np.ndarray, truth: np.ndarray) -> float:
@@ -332,7 +330,7 @@ def rms(found: np.ndarray, truth: np.ndarray) -> float:
 def run(seed: int = 0, table_path: str | None = None) -> dict[str, Any]:
     """Error by regime and time for every method; what is done already is kept."""
     base = {"seed": seed, "regimes": {n: [dict(r[0]), r[2].tolist()] for n, r in REGIMES.items()}}
-    exact = _Parts(TRANSPORT, **base)
+    exact = _parts(TRANSPORT, **base)
     truth = {
         name: np.array(
             exact(
@@ -368,7 +366,7 @@ def run(seed: int = 0, table_path: str | None = None) -> dict[str, Any]:
     }
 
 
-def _walks(exact: _Parts, seed: int, truth: Mapping[str, np.ndarray], methods: list) -> None:
+def _walks(exact: Parts, seed: int, truth: Mapping[str, np.ndarray], methods: list) -> None:
     def walk(regime: str, method: str, rays: int, count: int) -> dict[str, float]:
         found, core, wall = [], [], []
         for i, specimen in enumerate(specimens(regime, seed)[-count:]):
@@ -439,7 +437,7 @@ def _walks(exact: _Parts, seed: int, truth: Mapping[str, np.ndarray], methods: l
         )  # fmt: skip
 
 
-def _deterministic(exact: _Parts, seed: int, truth: Any, methods: list) -> None:
+def _deterministic(exact: Parts, seed: int, truth: Any, methods: list) -> None:
     def measured(function: Callable[[tuple[Specimen, ...], np.ndarray], np.ndarray]) -> dict:
         easy = specimens("easy", seed)
         with_all = easy[-1:]  # with particles in every stratum
@@ -490,7 +488,7 @@ def _from_table(base: Any, seed: int, path: str | None, truth: Any, methods: lis
     data = table.read_table(path) if path else _fresh.training_table("adding", TABLE_ROWS)
     data = data.isel(row=slice(0, TABLE_ROWS))
     grid = data["wavelength_nm"].values
-    parts = _Parts((*TRANSPORT, "table", "surrogate"), **base, rows=int(data.sizes["row"]))
+    parts = _parts((*TRANSPORT, "table", "surrogate"), **base, rows=int(data.sizes["row"]))
 
     def measured(kind: str) -> dict:
         by_form = {form: Regression(kind, data, form, seed) for form in table.FORMS}
@@ -510,7 +508,7 @@ def _from_table(base: Any, seed: int, path: str | None, truth: Any, methods: lis
 def _embedded(base: Any, seed: int, truth: Any, methods: list) -> dict:
     surrogate = load_surrogate()
     record = _shared.surrogate_record(surrogate)
-    parts = _Parts((*TRANSPORT, "surrogate"), **base, surrogate=record["sha256"])
+    parts = _parts((*TRANSPORT, "surrogate"), **base, surrogate=record["sha256"])
     whole = int(surrogate.at(surrogate.forms[0]).components.shape[0])
 
     def measured(count: int) -> dict:

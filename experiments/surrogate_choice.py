@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import jax
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import _fresh, _shared
-from hylios_fit import training
+from hylios_fit import table, training
 from hylios_fit.surrogate import features
 
 FORM = "complex"
@@ -41,28 +42,27 @@ def run(
     from tqdm import tqdm
 
     if data is None:
-        data = _fresh.training_table("adding", _fresh.ROWS, progress=progress)
-    names = tuple(training.box_of(data))
+        data = _fresh.training_table("adding", table.ROWS, progress=progress)
+    names = training.box_of(data)[0]
     key = jax.random.fold_in(jax.random.key(seed), 400)
     settings = {"local_steps": local_steps, "specimens": specimens, "rows": int(data.sizes["row"])}
     folder = _shared.checkpoint("surrogate_choice", MODULES, seed=seed, fresh=fresh, **settings)
     held = {}
     for number, (kind, free) in enumerate((("usual", ("usual",)), ("every", names))):
-        path = folder / f"{kind}.npz"
-        if not path.exists():
-            own = jax.random.fold_in(key, number)
-            found = _fresh.specimens(data, FORM, fresh, own, free, progress)
-            _shared.save_arrays(path, **found._asdict())
-        held[kind] = _fresh.Fresh(**_shared.load_arrays(path))
+        own = jax.random.fold_in(key, number)
+        solved = partial(_fresh.specimens, data, FORM, fresh, own, free, progress)
+        found = _shared.kept_arrays(folder / f"{kind}.npz", lambda f=solved: f()._asdict())
+        held[kind] = _fresh.Fresh(**found)
     drawn = training.specimens(data, seed, specimens)
-    path = folder / "answers.npz"
-    if not path.exists():
+
+    def answers() -> dict[str, np.ndarray]:
         print("local regression", flush=True)
         with training.quietly():
             local = training.learn_locally(data, FORM, seed, steps=local_steps)
         every = {kind: local(names, part.rows) for kind, part in held.items()}
-        _shared.save_arrays(path, drawn=local(names, drawn), **every)
-    log = _shared.load_arrays(path)
+        return {"drawn": local(names, drawn), **every}
+
+    log = _shared.kept_arrays(folder / "answers.npz", answers)
 
     def seen(rows: np.ndarray) -> np.ndarray:
         return np.asarray(features(names, FORM, jnp.asarray(rows, jnp.float32)), float)

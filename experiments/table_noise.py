@@ -41,7 +41,7 @@ def run(
     held: Any = None
     for generator in table.GENERATORS:
         whole, took = _table(folder, generator, max(rows), progress)
-        names = tuple(training.box_of(whole))
+        names = training.box_of(whole)[0]
         if held is None:
             key = jax.random.fold_in(jax.random.key(seed), 300)
             held = _fresh.specimens(whole, FORM, fresh, key, names, progress)

@@ -69,9 +69,7 @@ def run(seed: int = 0, specimens: int = SPECIMENS, progress: bool = True) -> dic
     parts = []
     for number in tqdm(range(4 + specimens), disable=not progress, unit="specimen"):
         path = folder / f"{number}.npz"
-        if not path.exists():
-            _shared.save_arrays(path, **_one(number, seed))
-        parts.append(_shared.load_arrays(path))
+        parts.append(_shared.kept_arrays(path, lambda number=number: _one(number, seed)))
     result: dict[str, Any] = {
         "rays": RAYS, "order": ORDER, "random_specimens": specimens, "enough": ENOUGH,
     }  # fmt: skip

@@ -87,15 +87,14 @@ def train(
     table = read_table(table_path, LEAST_ROWS)
     forms = tuple(forms_of(table))
     nm = table["wavelength_nm"].values
-    box = box_of(table)
-    names = tuple(box)
+    names, lower, upper = box_of(table)
     curve = fresnel.surface_curve(
         float(np.radians(table.attrs["incidence_deg"])), Specimen().roughness
     )
     arrays: dict[str, np.ndarray] = {
         "wavelength_nm": nm,
-        "lower": np.array([low for low, _ in box.values()]),
-        "upper": np.array([high for _, high in box.values()]),
+        "lower": lower,
+        "upper": upper,
         "fresnel": curve.convert(domain=(0.5, 2.5)).coef,
     }
     for form, fitted in _fits(table, forms, seed, progress).items():
@@ -131,12 +130,14 @@ def train(
     return check_report(load_surrogate(path))
 
 
-def box_of(table: Any) -> dict[str, tuple[float, float]]:
-    """Range of every parameter that can be learned from a table."""
-    parts = (table[name].values for name in ("parameter", "lower", "upper"))
-    return {
-        str(name): (float(low), float(high)) for name, low, high in zip(*parts, strict=True)
-    } | FURTHER
+def box_of(table: Any) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """Names (P) of all that can be learned from a table, and their ranges: lower, upper."""
+    lower, upper = np.array(list(FURTHER.values())).T
+    return (
+        (*(str(name) for name in table["parameter"].values), *FURTHER),
+        np.concatenate([table["lower"].values, lower]),
+        np.concatenate([table["upper"].values, upper]),
+    )
 
 
 def fresh(
@@ -166,20 +167,12 @@ def _check(
     drawn = np.concatenate([fresh(*box, checks - part, key), fresh(*box, part, key, member.names)])
     found = {}
     total = checks * len(surrogate.forms)
-    with (
-        tqdm(total=total, desc="check", unit="specimen", disable=not progress) as bar,
-        ThreadPoolExecutor(THREADS) as pool,
-    ):
+    with tqdm(total=total, desc="check", unit="specimen", disable=not progress) as bar:
         for form in surrogate.forms:
             member = surrogate.at(form)
-            lots = [drawn[i : i + TOGETHER] for i in range(0, checks, TOGETHER)]
-            truth = []
-            for lot in pool.map(partial(solve, member.names, form), lots):
-                truth.append(lot)
-                bar.update(len(lot))
-            error = np.asarray(member(jnp.asarray(drawn, jnp.float32)), float)
-            error = error - np.concatenate(truth)
-            scaled = error / member.error_scale(np.concatenate(truth))
+            truth = solved(member.names, form, drawn, bar)
+            error = np.asarray(member(jnp.asarray(drawn, jnp.float32)), float) - truth
+            scaled = error / member.error_scale(truth)
             found[form] = (*_error(scaled, len(PRIORS)), error, drawn)
     return found
 
@@ -203,6 +196,17 @@ def _regions(
                 rms = float(np.sqrt(np.mean(error[mine] ** 2)))
                 found.append((text, round(rms, 6), round(float(np.abs(error[mine]).max()), 6)))
     return sorted(found, key=lambda row: -row[1])[:REGIONS]
+
+
+def solved(names: tuple[str, ...], form: str, rows: np.ndarray, bar: Any) -> np.ndarray:
+    """`solve` for `TOGETHER` rows at a time, side by side; `bar` counts them."""
+    lots = [rows[i : i + TOGETHER] for i in range(0, len(rows), TOGETHER)]
+    found = []
+    with ThreadPoolExecutor(THREADS) as pool:
+        for lot in pool.map(partial(solve, names, form), lots):
+            found.append(lot)
+            bar.update(len(lot))
+    return np.concatenate(found)
 
 
 def solve(names: tuple[str, ...], form: str, rows: np.ndarray) -> np.ndarray:
@@ -350,7 +354,7 @@ def _fits(
     """By form: every number of the fitted pipeline by name."""
     from tqdm import tqdm
 
-    names, asked = tuple(box_of(table)), specimens(table, seed)
+    names, asked = box_of(table)[0], specimens(table, seed)
     with (
         tqdm(
             total=2 * len(forms) * len(RATES), desc="train", unit="stage", disable=not progress
@@ -387,19 +391,18 @@ def specimens(table: Any, seed: int, count: int | None = None) -> np.ndarray:
     all."""
     from scipy.stats import qmc
 
-    box = box_of(table)
+    names, lower, upper = box_of(table)
     spreads = dict(zip(table["parameter"].values, table["spread"].values, strict=True))
     count = count or SPECIMENS
     part = count // 10
-    sobol = qmc.Sobol(len(box), rng=np.random.default_rng([seed, 2]))
+    sobol = qmc.Sobol(len(names), rng=np.random.default_rng([seed, 2]))
     unit = sobol.random(1 << math.ceil(math.log2(2 * part)))[: 2 * part]
     columns = [
         spread(u, low, high, spreads.get(name, "linear"))
-        for u, (name, (low, high)) in zip(unit.T, box.items(), strict=True)
+        for u, name, low, high in zip(unit.T, names, lower, upper, strict=True)
     ]
     over = np.stack(columns, axis=1)
-    over[part:, USUAL:] = Specimen().parameters(tuple(box))[USUAL:]
-    names, (lower, upper) = tuple(box), np.array(list(box.values())).T
+    over[part:, USUAL:] = Specimen().parameters(names)[USUAL:]
     prior = [
         state_vector(names, lower, upper, free).prior_draws(
             jax.random.fold_in(jax.random.key(seed), 2 + number), drawn

@@ -417,10 +417,10 @@ def test_training_ignores_unfinished_rows_and_says_when_too_few(tmp_path):
 def test_what_is_learned_from_fills_the_box_the_published_model_and_the_prior():
     rows = table._empty(128, 1, 0)
     drawn = training.specimens(rows, 0, 1000)
-    lower, upper = np.array(list(training.box_of(rows).values())).T
+    names, lower, upper = training.box_of(rows)
     assert drawn.shape == (1000, len(lower))
     assert ((drawn >= lower) & (drawn <= upper)).all()
-    model = Specimen().parameters(tuple(training.box_of(rows)))
+    model = Specimen().parameters(names)
     others = (drawn[:, table.USUAL :] == model[table.USUAL :]).all(axis=1)
     assert np.flatnonzero(others).tolist() == list(range(100, 500))
     # over the whole range of each, and not only where the prior is
