@@ -1,8 +1,10 @@
-"""Which regression on how many principal components: error against cost."""
+"""Which regression on how many principal components, and how it is trained: error against cost."""
 
 from __future__ import annotations
 
 import itertools
+import time
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
@@ -13,18 +15,25 @@ import numpy as np
 
 from experiments import _fresh, _shared
 from hylios_fit import table, training
+from hylios_fit.perceptron import Perceptron
 from hylios_fit.surrogate import features
+from hylios_fit.threads import one_blas_thread
 
 FORM = "complex"
-LOCAL_STEPS = 60_000
-STEPS = 20_000
+LOCAL_STEPS = 10_000
+STEPS = 10_000
+BATCH = 1024
+ADAM, HALVINGS = 4, 9
 SPECIMENS = 32_768
 FRESH = 64  # of each kind
-PERCEPTRONS = ((64, 64), (128, 128), (192, 192), (192, 128, 128), (256, 128, 128), (384, 192, 192))
+PERCEPTRONS = (
+    (64, 64), (128, 128), (128, 128, 128), (192, 128, 128), (256, 128, 128), (384, 192, 192),
+)  # fmt: skip
 COMPONENTS = (5, 10, 20, 40, 60, 80)
 BANDS = 3
-MODULES = ("training", "table", "surrogate", "skin", "adding", "streams", "statevector")
-CORRELATED = 1e9  # for `training.fit`: inputs are turned, not scaled
+MODULES = (
+    "training", "perceptron", "table", "surrogate", "skin", "adding", "streams", "statevector",
+)  # fmt: skip
 
 
 def run(
@@ -32,6 +41,7 @@ def run(
     data: Any = None,
     local_steps: int = LOCAL_STEPS,
     steps: int = STEPS,
+    batch: int = BATCH,
     specimens: int = SPECIMENS,
     fresh: int = FRESH,
     perceptrons: tuple[tuple[int, ...], ...] = PERCEPTRONS,
@@ -57,7 +67,7 @@ def run(
 
     def answers() -> dict[str, np.ndarray]:
         print("local regression", flush=True)
-        with training.quietly():
+        with one_blas_thread():
             local = training.learn_locally(data, FORM, seed, steps=local_steps)
         every = {kind: local(names, part.rows) for kind, part in held.items()}
         return {"drawn": local(names, drawn), **every}
@@ -73,30 +83,56 @@ def run(
 
     x, asked = seen(drawn), {kind: seen(part.rows) for kind, part in held.items()}
 
-    def perceptron(job: tuple[tuple[int, ...], float]) -> dict[str, Any]:
-        hidden, faintest = job
-        fitted = training.fit(x, log["drawn"], seed, None, hidden, steps, faintest)
-        widths = (x.shape[1], *hidden, BANDS)
+    def learned(network: Any) -> dict[str, Any]:
+        start = time.perf_counter()
+        fitted = training.fit(x, log["drawn"], network)
+        widths = (x.shape[1], *network.hidden, BANDS)
         return {
-            "hidden": list(hidden),
-            "decorrelated": faintest < 1.0,
+            "hidden": list(network.hidden),
+            "seconds": round(time.perf_counter() - start, 1),
             "products": sum(a * b for a, b in itertools.pairwise(widths)),
             "rms": rms({kind: _perceptron(fitted, part) for kind, part in asked.items()}),
         }
 
-    jobs = [(hidden, training.FAINTEST) for hidden in perceptrons]
-    jobs.append((training.HIDDEN, CORRELATED))
-    with training.quietly(), ThreadPoolExecutor(training.THREADS) as pool:
-        made = pool.map(perceptron, jobs[::-1])  # the largest first
-        made = list(tqdm(made, total=len(jobs), unit="perceptron", disable=not progress))[::-1]
+    sizes = [Perceptron(hidden, steps, batch, seed=seed) for hidden in perceptrons]
+    networks = [Adam(training.HIDDEN, ADAM * steps, batch, seed), *sizes[::-1]]  # longest first
+    with one_blas_thread(), ThreadPoolExecutor(training.THREADS) as pool:
+        made = pool.map(learned, networks)
+        adam, *made = tqdm(made, total=len(networks), unit="perceptron", disable=not progress)
     return {
-        "form": FORM, **settings, "steps": steps, "fresh": fresh, "bands": BANDS,
+        "form": FORM, **settings, "steps": steps, "batch": batch, "fresh": fresh, "bands": BANDS,
         "chosen": list(training.HIDDEN), "components": training.COMPONENTS,
         "local": rms(log),
-        "perceptrons": made,
+        "perceptrons": made[::-1],
+        "adam": {**adam, "steps": ADAM * steps},
         "ridge": [_ridge(x, log["drawn"], asked, degree, rms) for degree in (1, 2)],
         "truncated": _truncated(log["drawn"]),
     }  # fmt: skip
+
+
+class Adam:
+    """Scikit-learn's own perceptron, its rate halved eight times over the steps."""
+
+    def __init__(self, hidden: tuple[int, ...], steps: int, batch: int, seed: int):
+        self.hidden, self.steps, self.batch, self.seed = hidden, steps, batch, seed
+
+    def fit(self, x: np.ndarray, y: np.ndarray) -> None:
+        from sklearn.exceptions import ConvergenceWarning
+        from sklearn.neural_network import MLPRegressor
+
+        x, y = x.astype(np.float32), y.astype(np.float32)
+        batch: Any = self.batch
+        network: Any = MLPRegressor(
+            hidden_layer_sizes=self.hidden, activation="tanh", batch_size=batch, alpha=0.0, warm_start=True,
+            max_iter=max(round(self.steps * self.batch / len(x) / HALVINGS), 1), tol=0.0,
+            n_iter_no_change=10**9, random_state=self.seed,
+        )  # fmt: skip
+        for halved in range(HALVINGS):
+            network.set_params(learning_rate_init=3e-3 * 0.5**halved)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ConvergenceWarning)  # it ends as it was told to
+                network.fit(x, y)
+        self.coefs_, self.intercepts_ = network.coefs_, network.intercepts_
 
 
 def _perceptron(fitted: dict[str, np.ndarray], x: np.ndarray) -> np.ndarray:
@@ -142,25 +178,26 @@ def draw(result: dict[str, Any], path: Any) -> None:
     labels = {"usual": "pigments, blood, water, lipids free", "every": "every parameter free"}
     for (kind, label), colour in zip(labels.items(), _shared.COLOURS, strict=False):
         for name, marker in (("perceptrons", "o"), ("ridge", "^")):
-            points = [p for p in result[name] if p.get("decorrelated", True)]
+            points = result[name]
             left.plot(
                 [p["products"] for p in points], [p["rms"][kind] for p in points], marker,
-                color=colour, label=f"{name[:10].rstrip('s')}, {label}",
+                color=colour, label=f"{name.rstrip('s')}, {label}",
             )  # fmt: skip
-        for point in result["perceptrons"]:
-            at = point["products"], point["rms"][kind]
-            if not point["decorrelated"]:
-                left.plot(*at, "x", color=colour, label="its inputs not decorrelated")
-            elif kind == "usual":
-                left.annotate(
-                    "-".join(map(str, point["hidden"])), at,
-                    (-6 if len(point["hidden"]) == 2 else 2, -5), textcoords="offset points",
-                    fontsize=7, rotation=90, ha="center", va="top",
-                )  # fmt: skip
+        adam = result["adam"]
+        left.plot(
+            adam["products"], adam["rms"][kind], "x", color=colour,
+            label=f"by Adam in {adam['steps'] // result['steps']} times the steps",
+        )  # fmt: skip
+        for point in result["perceptrons"] if kind == "usual" else ():
+            left.annotate(
+                "-".join(map(str, point["hidden"])), (point["products"], point["rms"][kind]),
+                (-6 if len(point["hidden"]) == 2 else 2, -5), textcoords="offset points",
+                fontsize=7, rotation=90, ha="center", va="top",
+            )  # fmt: skip
         left.axhline(result["local"][kind], color=colour, ls=":", lw=1)
     _shared.logarithmic(left.xaxis)
     left.set_yscale("log")
-    left.set_ylim(bottom=3.5e-4)
+    left.set_ylim(bottom=1e-4)
     left.tick_params(axis="x", labelsize=8, rotation=30)
     left.legend(fontsize=7)
     title = "dotted: what they learned from"

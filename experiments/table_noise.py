@@ -15,9 +15,10 @@ import numpy as np
 
 from experiments import _fresh, _shared
 from hylios_fit import table, training
+from hylios_fit.threads import one_blas_thread
 
 ROWS = (1024, 4096, 16_384)
-STEPS = 60_000
+STEPS = 20_000
 FRESH = 128
 FORM = "complex"
 
@@ -46,7 +47,7 @@ def run(
             key = jax.random.fold_in(jax.random.key(seed), 300)
             held = _fresh.specimens(whole, FORM, fresh, key, names, progress)
         used = partial(_learned, whole, steps=steps, seed=seed)
-        with training.quietly(), ThreadPoolExecutor(training.THREADS) as pool:
+        with one_blas_thread(), ThreadPoolExecutor(training.THREADS) as pool:
             learned = list(pool.map(used, rows))
         errors = [held.errors(answer(names, held.rows)) for answer in learned]
         noise = whole["standard_error"].values[: max(rows)]

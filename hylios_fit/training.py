@@ -11,9 +11,8 @@ axis for them (`index_dispersion`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hylios_fit import fresnel
+from hylios_fit.perceptron import STAGES, Perceptron
 from hylios_fit.skin import LAYERS, Layers, Specimen
 from hylios_fit.statevector import PRIORS, derived, state_vector
 from hylios_fit.surrogate import (
@@ -50,16 +50,14 @@ from hylios_fit.threads import one_blas_thread
 FURTHER = {"index_dispersion": (-0.005, 0.035)}
 """Ranges of parameters that the table has no axis for and its indices cover."""
 LOCAL_HIDDEN = (128, 128, 128)
-LOCAL_STEPS = 500_000
-LOCAL_BATCH = 256
+LOCAL_STEPS = 40_000
+LOCAL_BATCH = 2048
 TRUST = 1e-3  # error of the logarithm that rows without noise are learned to, about
 SPECIMENS = 131_072  # of each form, that the local regression answers for
 COMPONENTS = 80
-HIDDEN = (256, 128, 128)
-STEPS = 300_000
-BATCH = 256
-RATES = tuple((3e-3 * 0.5**k, 1 / 9) for k in range(9))  # and the share of the steps
-FAINTEST = 1e-3  # variance of what the inputs say beyond each other, below which it counts less
+HIDDEN = (192, 128, 128)
+STEPS = 80_000
+BATCH = 2048
 LEAST_ROWS = 64  # of each form
 CHECK_ORDER = 8  # of the solver that they are held against
 TOGETHER = 16  # of them have the same refractive indices
@@ -311,7 +309,7 @@ def learn_locally(
     x = x.reshape(-1, x.shape[-1])
     centre, scale = x.mean(axis=0), x.std(axis=0) + 1e-6
     middle, unit = float(log.mean()), float(log.std())
-    y = ((log - middle) / unit).astype(np.float32).reshape(-1)
+    y = ((log - middle) / unit).astype(np.float32).reshape(-1, 1)
     weight, variance = None, float(noise.mean()) / unit**2
     if table.attrs["generator"] == "walker":  # the errors of `adding` are no noise
         weight = (1.0 / (noise + TRUST**2)).reshape(-1)
@@ -320,22 +318,17 @@ def learn_locally(
     x -= centre
     x /= scale
     steps = steps or LOCAL_STEPS
-    network = _network(x, y, LOCAL_HIDDEN, steps, LOCAL_BATCH, variance, seed, bar, weight)
-    weights = [jnp.asarray(w, jnp.float32) for w in network.coefs_]
-    biases = [jnp.asarray(b, jnp.float32) for b in network.intercepts_]
+    network = Perceptron(
+        LOCAL_HIDDEN, steps, LOCAL_BATCH, variance=variance, seed=seed, bar=bar
+    ).fit(x, y, weight)
 
-    @jax.jit
-    def answer(x: Array) -> Array:
-        x = (x - centre[None, None]) / scale[None, None]
-        for i, (w, b) in enumerate(zip(weights, biases, strict=True)):
-            x = x @ w + b[None, None]
-            if i < len(weights) - 1:
-                x = jnp.tanh(x)
-        return x[..., 0] * unit + middle
+    def answer(x: Array) -> np.ndarray:
+        found = network.predict((x.reshape(-1, x.shape[-1]) - centre[None]) / scale[None])
+        return found.reshape(x.shape[:-1]) * unit + middle
 
     def every(names: tuple[str, ...], rows: np.ndarray) -> np.ndarray:
         of = _inputs(names, form)
-        return np.concatenate([np.asarray(answer(of(lot))) for lot in _lots(rows)])
+        return np.concatenate([answer(of(lot)) for lot in _lots(rows)])
 
     return every
 
@@ -357,31 +350,19 @@ def _fits(
     names, asked = box_of(table)[0], specimens(table, seed)
     with (
         tqdm(
-            total=2 * len(forms) * len(RATES), desc="train", unit="stage", disable=not progress
+            total=2 * len(forms) * STAGES, desc="train", unit="stage", disable=not progress
         ) as bar,
-        quietly(),
+        one_blas_thread(),
         ThreadPoolExecutor(THREADS) as pool,
     ):
 
         def one(form: str) -> dict[str, np.ndarray]:
             log = learn_locally(table, form, seed, bar)(names, asked)
             x = features(names, form, jnp.asarray(asked, jnp.float32))
-            return fit(np.asarray(x, float), log, seed, bar)
+            network = Perceptron(HIDDEN, STEPS, BATCH, seed=seed, bar=bar)
+            return fit(np.asarray(x, float), log, network)
 
         return dict(zip(forms, pool.map(one, forms), strict=True))
-
-
-@contextmanager
-def quietly() -> Iterator[None]:
-    """What `learn_locally` wants around it: one thread of linear algebra for each regression, and
-    no word of epochs that end as they were set to. Outside the threads, which share both."""
-    import warnings
-
-    from sklearn.exceptions import ConvergenceWarning
-
-    with one_blas_thread(), warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        yield
 
 
 def specimens(table: Any, seed: int, count: int | None = None) -> np.ndarray:
@@ -412,49 +393,12 @@ def specimens(table: Any, seed: int, count: int | None = None) -> np.ndarray:
     return np.concatenate([over, *prior])
 
 
-def _network(
-    x: np.ndarray, y: np.ndarray, hidden: tuple[int, ...], steps: int, batch: int,
-    variance: float, seed: int, bar: Any, weight: np.ndarray | None = None,
-) -> Any:  # fmt: skip
-    """A perceptron of about `steps` batches.
-
-    The penalty is that of the most probable weights, where they have variance 1/width and each
-    target has noise of this variance, or of this variance over its `weight`.
-    """
-    from sklearn.neural_network import MLPRegressor
-
-    lot: Any = min(batch, len(x))
-    network: Any = MLPRegressor(
-        hidden_layer_sizes=hidden, activation="tanh", solver="adam", batch_size=lot,
-        alpha=variance * max(hidden) * lot / len(x),  # the penalty is added in every batch
-        warm_start=True, tol=0.0, n_iter_no_change=10**9, random_state=seed,
-    )  # fmt: skip
-    for rate, share in RATES:
-        epochs = max(round(share * steps * lot / len(x)), 1)
-        network.set_params(learning_rate_init=rate, max_iter=epochs)
-        network.fit(x, y, weight)
-        if bar is not None:
-            bar.update()
-    return network
-
-
-def _decorrelating(x: np.ndarray, faintest: float) -> np.ndarray:
-    """(f, f): standardised inputs (n, f) times this have no correlations, and variances of 1 but
-    where they were below `faintest`. Inputs that nearly repeat each other are learned slowly: in
-    as many steps the error was a third larger without."""
-    size, vectors = np.linalg.eigh(np.cov(x.T))
-    size = np.maximum(size, 0.0)
-    return vectors * np.sqrt((1.0 + faintest) / (size + faintest))
-
-
-def fit(
-    x: np.ndarray, log: np.ndarray, seed: int = 0, bar: Any = None,
-    hidden: tuple[int, ...] | None = None, steps: int | None = None, faintest: float = FAINTEST,
-) -> dict[str, np.ndarray]:  # fmt: skip
+def fit(x: np.ndarray, log: np.ndarray, network: Any = None) -> dict[str, np.ndarray]:
     """Standardise, reduce, regress: features (n, f), and what they give (n, w).
 
-    A perceptron of `HIDDEN` units and `STEPS` unless told otherwise. Returns every number of what
-    the surrogate evaluates, by name.
+    The network is scikit-learn's `MLPRegressor` or like it, not fitted yet; by default a
+    `Perceptron` of `HIDDEN` units and `STEPS`. Returns every number of what the surrogate
+    evaluates, by name.
     """
     from sklearn.decomposition import PCA
     from sklearn.preprocessing import StandardScaler
@@ -462,18 +406,14 @@ def fit(
     scaler: Any = StandardScaler().fit(x)
     # in single precision the components beyond 3e-4 of the first were noise, and cost 4e-4
     log = log.astype(float)
-    pca: Any = PCA(min(COMPONENTS, len(x) // 4), random_state=seed).fit(log)
+    pca: Any = PCA(min(COMPONENTS, len(x) // 4), random_state=0).fit(log)
     scores = pca.transform(log)
     unit = scores[:, 0].std()  # one scale for all, so that what matters more weighs more
-    inputs = scaler.transform(x)
-    apart = _decorrelating(inputs, faintest)
-    inputs = (inputs @ apart).astype(np.float32)
-    targets = (scores / unit).astype(np.float32)
-    network = _network(inputs, targets, hidden or HIDDEN, steps or STEPS, BATCH, 0.0, seed, bar)
-    weights = [np.asarray(w, float) for w in network.coefs_]
-    biases = [np.asarray(b, float) for b in network.intercepts_]
-    weights[0] = apart @ weights[0]
-    weights[-1], biases[-1] = weights[-1] * unit, biases[-1] * unit
+    network = network or Perceptron(HIDDEN, STEPS, BATCH)
+    network.fit(scaler.transform(x), scores / unit)
+    weights, biases = (
+        [*parts[:-1], parts[-1] * unit] for parts in (network.coefs_, network.intercepts_)
+    )
     return {
         "centre": scaler.mean_,
         "scale": scaler.scale_,

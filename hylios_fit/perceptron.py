@@ -1,0 +1,184 @@
+"""A perceptron for scikit-learn's pipelines, its weights found in JAX.
+
+What is learned here is smooth and known to many digits. Adam alone, which scikit-learn's own
+perceptron has, creeps along the narrow valleys of such a task. SOAP (Vyas et al. 2024,
+arXiv:2409.11321) runs Adam along the eigenvectors of the second moments of each matrix's gradient,
+those of Shampoo (Gupta et al. 2018, arXiv:1802.09568), where the valleys hardly mix.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from sklearn.base import BaseEstimator, RegressorMixin
+
+TURN = 25  # steps between two turns of the eigenvectors
+WARM = 0.02  # share of the steps in which the rate rises; after it falls as a cosine does
+FIRST, SECOND, TURNING = 0.95, 0.99, 0.99  # memory of both moments, and of what turns the vectors
+TINY = 1e-8
+STAGES = 20  # of a fit, for its progress bar
+
+
+class Perceptron(RegressorMixin, BaseEstimator):
+    """Layers of hidden units (tanh) and a linear one, fitted by least squares in float32.
+
+    The weights are the most probable ones, where they have variance 1/width and each target has
+    noise of the given variance (over its sample weight).
+
+    Args:
+        hidden: units of each hidden layer.
+        steps: of the optimiser, rounded up to whole turns of its eigenvectors.
+        batch: examples in each, drawn with replacement.
+        rate: the largest size of a step.
+        variance: of the targets' noise; with 0 all weights are equally probable.
+        seed: of the first weights and of the batches.
+        bar: a progress bar, updated `STAGES` times.
+    """
+
+    def __init__(
+        self, hidden: tuple[int, ...] = (128, 128, 128), steps: int = 20_000, batch: int = 1024,
+        rate: float = 3e-3, variance: float = 0.0, seed: int = 0, bar: Any = None,
+    ):  # fmt: skip
+        self.hidden = hidden
+        self.steps = steps
+        self.batch = batch
+        self.rate = rate
+        self.variance = variance
+        self.seed = seed
+        self.bar = bar
+
+    def fit(self, x: Any, y: Any, sample_weight: Any = None) -> Perceptron:
+        """Inputs (n, f), standardised, and targets (n, k) of about unit size; weights (n,)."""
+        x, y = jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32)
+        weight = jnp.asarray(np.ones(len(x)) if sample_weight is None else sample_weight)
+        data = _Data(x, y, weight.astype(jnp.float32))
+        first, batches = jax.random.split(jax.random.key(self.seed))
+        widths = (x.shape[1], *self.hidden, y.shape[1])
+        layers = tuple(
+            _start(jax.random.fold_in(first, i), wide, narrow)
+            for i, (wide, narrow) in enumerate(itertools.pairwise(widths))
+        )
+        turns = max(math.ceil(self.steps / TURN), 1)
+        penalty = self.variance * max(self.hidden) / len(x)
+        marks = np.linspace(0, turns, STAGES + 1).astype(int)
+        for low, high in itertools.pairwise(marks):
+            layers = _descend(
+                layers, data, batches, (low, high, turns), self.rate, penalty, batch=self.batch
+            )
+            jax.block_until_ready(layers)
+            if self.bar is not None:
+                self.bar.update()
+        self.coefs_ = [np.asarray(layer.matrix[:-1]) for layer in layers]
+        self.intercepts_ = [np.asarray(layer.matrix[-1]) for layer in layers]
+        return self
+
+    def predict(self, x: Any) -> np.ndarray:
+        """Targets (n, k) at inputs (n, f)."""
+        pairs = zip(self.coefs_, self.intercepts_, strict=True)
+        matrices = [jnp.concatenate([w, b[None]]) for w, b in pairs]
+        return np.asarray(_answer(matrices, jnp.asarray(x, jnp.float32)))
+
+
+class _Data(NamedTuple):
+    x: Float[Array, "n f"]
+    y: Float[Array, "n k"]
+    weight: Float[Array, "n"]
+
+
+class _Layer(NamedTuple):
+    """A layer's weights, the biases as their last row, and what the optimiser remembers of it."""
+
+    matrix: Float[Array, "i o"]
+    first: Float[Array, "i o"]  # mean gradient
+    second: Float[Array, "i o"]  # mean of its squares along the eigenvectors
+    left: Float[Array, "i i"]  # mean of gradient times its transpose
+    right: Float[Array, "o o"]
+    rows: Float[Array, "i i"]  # eigenvectors of both, as they were at the last turn
+    columns: Float[Array, "o o"]
+
+
+def _start(key: Any, wide: int, narrow: int) -> _Layer:
+    weights = jax.random.normal(key, (wide, narrow), jnp.float32) / math.sqrt(wide)
+    matrix = jnp.concatenate([weights, jnp.zeros((1, narrow), jnp.float32)])
+    none = jnp.zeros_like(matrix)
+    one = [jnp.eye(n, dtype=jnp.float32) for n in matrix.shape]
+    return _Layer(matrix, none, none, 0.0 * one[0], 0.0 * one[1], *one)
+
+
+def _forward(matrices: list[Array], x: Float[Array, "n f"]) -> Float[Array, "n k"]:
+    for i, matrix in enumerate(matrices):
+        x = jnp.tanh(x) if i else x
+        x = _times(x, matrix[:-1]) + matrix[-1][None]
+    return x
+
+
+_answer = jax.jit(_forward)
+_times = partial(jnp.matmul, precision="highest")
+
+
+def _loss(matrices: list[Array], data: _Data, penalty: Array) -> Array:
+    error = jnp.sum((_forward(matrices, data.x) - data.y) ** 2, axis=1)
+    weights = sum(jnp.sum(matrix[:-1] ** 2) for matrix in matrices)
+    return 0.5 * (jnp.mean(data.weight * error) + penalty * weights)
+
+
+@partial(jax.jit, static_argnames="batch")
+def _descend(
+    layers: tuple[_Layer, ...], data: _Data, key: Any, turns: Any, rate: Any, penalty: Any,
+    batch: int,
+) -> tuple[_Layer, ...]:  # fmt: skip
+    """From one turn of the eigenvectors to another; the third of `turns` is how many in all."""
+    low, high, whole = turns
+
+    def step(number: Array, layers: tuple[_Layer, ...]) -> tuple[_Layer, ...]:
+        chosen = jax.random.randint(jax.random.fold_in(key, number), (batch,), 0, len(data.x))
+        drawn = _Data(*(part[chosen] for part in data))
+        gradients = jax.grad(_loss)([layer.matrix for layer in layers], drawn, penalty)
+        count = number.astype(jnp.float32) + 1.0
+        done = count / (whole.astype(jnp.float32) * TURN)
+        size = rate * jnp.minimum(done / WARM, 0.5 + 0.5 * jnp.cos(math.pi * done))
+        pairs = zip(layers, gradients, strict=True)
+        return tuple(_move(layer, gradient, count, size) for layer, gradient in pairs)
+
+    def turn(number: Array, layers: tuple[_Layer, ...]) -> tuple[_Layer, ...]:
+        layers = jax.lax.fori_loop(number * TURN, (number + 1) * TURN, step, layers)
+        return tuple(_turned(layer) for layer in layers)
+
+    return jax.lax.fori_loop(low, high, turn, layers)
+
+
+def _move(layer: _Layer, gradient: Array, count: Array, size: Array) -> _Layer:
+    def along(x: Array) -> Array:
+        return _times(_times(layer.rows.T, x), layer.columns)
+
+    first = FIRST * layer.first + (1.0 - FIRST) * gradient
+    second = SECOND * layer.second + (1.0 - SECOND) * along(gradient) ** 2
+    mean, square = along(first) / (1.0 - FIRST**count), second / (1.0 - SECOND**count)
+    step = _times(_times(layer.rows, mean / (jnp.sqrt(square) + TINY)), layer.columns.T)
+    return layer._replace(
+        matrix=layer.matrix - size * step,
+        first=first,
+        second=second,
+        left=TURNING * layer.left + (1.0 - TURNING) * _times(gradient, gradient.T),
+        right=TURNING * layer.right + (1.0 - TURNING) * _times(gradient.T, gradient),
+    )
+
+
+def _turned(layer: _Layer) -> _Layer:
+    """With eigenvectors one orthogonal iteration closer, the largest first."""
+
+    def closer(moments: Array, vectors: Array) -> tuple[Array, Array]:
+        size = jnp.sum(vectors * _times(moments, vectors), axis=0)
+        order = jnp.argsort(-size)
+        return jnp.linalg.qr(_times(moments, vectors[:, order]))[0], order
+
+    rows, top = closer(layer.left, layer.rows)
+    columns, side = closer(layer.right, layer.columns)
+    return layer._replace(rows=rows, columns=columns, second=layer.second[top][:, side])
