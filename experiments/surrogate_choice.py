@@ -123,7 +123,8 @@ class Adam:
         x, y = x.astype(np.float32), y.astype(np.float32)
         batch: Any = self.batch
         network: Any = MLPRegressor(
-            hidden_layer_sizes=self.hidden, activation="tanh", batch_size=batch, alpha=0.0, warm_start=True,
+            hidden_layer_sizes=self.hidden, activation="tanh", batch_size=batch, alpha=0.0,
+            warm_start=True,
             max_iter=max(round(self.steps * self.batch / len(x) / HALVINGS), 1), tol=0.0,
             n_iter_no_change=10**9, random_state=self.seed,
         )  # fmt: skip

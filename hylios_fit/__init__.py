@@ -27,6 +27,7 @@ Data flows one way through the modules; each imports only from those above it:
     instrument   bands, specular in or out, noise
     statevector  free parameters: names, order, bounds, priors, transforms
     planning     what a scene needs: the rest is dropped, the cheapest method taken
+    perceptron   the regression that training fits, and how it is fitted
     training     table -> surrogate, its error measured on fresh specimens
     results      Outcome, Fit, Posterior
     inversion    spectra -> fits

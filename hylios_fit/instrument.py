@@ -87,13 +87,18 @@ def noise_covariance(wavelength_nm: Any, reflectance: Any, noise: Any = None) ->
     if noise is not None:
         return np.diag(noise_sd(wavelength, values, noise) ** 2)
     level = np.maximum(values, 0)
-    distance = np.log(wavelength)
-    distance = np.sqrt(3) * np.abs(distance[:, None] - distance) / NOISE_LENGTH
-    matern = (1 + distance) * np.exp(-distance)
-    share = NOISE_SCALE**2 + NOISE_LOCAL**2 * matern
+    share = NOISE_SCALE**2 + NOISE_LOCAL**2 * smooth(wavelength, NOISE_LENGTH)
     covariance = NOISE_OFFSET**2 + share * np.outer(level, level)
     covariance[np.diag_indices_from(covariance)] += NOISE_BAND**2
     return covariance
+
+
+def smooth(wavelength_nm: np.ndarray, length: float) -> np.ndarray:
+    """Correlation (B, B) of what changes smoothly with wavelength (Matern 3/2), over a length in
+    the logarithm of the wavelength."""
+    distance = np.log(wavelength_nm)
+    distance = np.sqrt(3) * np.abs(distance[:, None] - distance) / length
+    return (1 + distance) * np.exp(-distance)
 
 
 def _checked(wavelength_nm: Any, reflectance: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -36,7 +36,7 @@ DIGITS = 7
 """Significant digits in the files."""
 
 _LEADING = ("spectrum", "outcome", "residual_rms", "reduced_chi2", "iterations")
-_TRAILING = ("inflation", "form", "form_probability", "informed_by_data", "message")
+_TRAILING = ("inflation", "model_error", "form", "form_probability", "informed_by_data", "message")
 _FITTED = ("spectrum", "wavelength_nm", "measured", "fitted", "residual", "sd")
 
 _LABELS = {
@@ -60,9 +60,9 @@ def write_estimates(directory: str | os.PathLike[str], fits: Sequence[Fit]) -> P
     """Write `estimates.csv`, one row for each fit in its order, and `settings.json` beside it.
 
     Columns: spectrum, outcome, residual_rms, reduced_chi2, iterations; `Q, Q_sd` for every
-    quantity and free parameter; then `Q_low, Q_high` (68 % interval) for each, inflation, form,
-    form_probability (of that form), informed_by_data (names of the quantities that the data tell,
-    parted by spaces) and message.
+    quantity and free parameter; then `Q_low, Q_high` (68 % interval) for each, inflation,
+    model_error, form, form_probability (of that form), informed_by_data (names of the quantities
+    that the data tell, parted by spaces) and message.
     What a failed fit does not have is an empty cell.
 
     Raises:
@@ -91,7 +91,15 @@ def _estimates_row(fit: Fit, quantities: Sequence[str]) -> list[str]:
         row += ["", ""] if one is None else [_text(one.low), _text(one.high)]
     informed = [name for name in quantities if name in fit.quantities and fit[name].informed]
     sure = _text(fit.form_probability.get(fit.form, math.nan))
-    return [*row, _text(fit.inflation), fit.form, sure, " ".join(informed), _message(fit)]
+    return [
+        *row,
+        _text(fit.inflation),
+        _text(fit.model_error),
+        fit.form,
+        sure,
+        " ".join(informed),
+        _message(fit),
+    ]
 
 
 def write_fitted(directory: str | os.PathLike[str], fits: Sequence[Fit]) -> Path:
@@ -236,6 +244,7 @@ def _read_fit(
         residual_rms=_value(cells, "residual_rms"),
         reduced_chi2=_value(cells, "reduced_chi2"),
         inflation=_value(cells, "inflation", 1.0),
+        model_error=_value(cells, "model_error", 0.0),
         iterations=int(cells["iterations"] or 0),
         form=cells.get("form", ""),
         form_probability={cells["form"]: sure} if math.isfinite(sure) else {},

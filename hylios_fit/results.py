@@ -142,13 +142,16 @@ class Fit:
     fitted: np.ndarray
     """(B,) reflectance of the model, specular in or out as `measured`."""
     sd: np.ndarray
-    """(B,) standard deviation of noise and surrogate error, as stated (not inflated)."""
+    """(B,) standard deviation of noise and surrogate error, as stated."""
     residual_rms: float
     """Root mean square of measured - fitted over the bands that were used."""
     reduced_chi2: float
-    """Squared residual in units of `sd` for each degree of freedom, before any inflation."""
+    """Squared residual in units of `sd` for each degree of freedom, as stated."""
     inflation: float
-    """Factor (>= 1) on `sd` that the intervals take into account."""
+    """Factor (>= 1) on the stated noise that the intervals take into account."""
+    model_error: float
+    """Share of the reflectance that they take the model to miss by instead, smoothly over
+    wavelength; 0 for none."""
     iterations: int
     """Steps of the solver, all starts and forms together."""
     form: str
@@ -170,7 +173,7 @@ class Fit:
     fixed: Mapping[str, float] = field(default_factory=dict)
     """Parameters that were held, with their values."""
     error_covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    """(B, B) S_eps as used, inflated; bands that were missing are NaN."""
+    """(B, B) S_eps as used, with inflation or model error; bands that were missing are NaN."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Versions, seed, noise, specular, range, starts: what makes the result repeatable."""
 

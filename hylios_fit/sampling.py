@@ -1,7 +1,7 @@
 """Fit to posterior, by emcee: independent ensembles in the whitened state, and their verdict.
 
 The density is that of `inversion`, with the form of the melanosomes that the fit kept and the
-noise as the fit inflated it. Moves are those of differential evolution, one in ten of them
+noise as the fit widened it. Moves are those of differential evolution, one in ten of them
 snooker (ter Braak 2006; ter Braak and Vrugt 2008). Of emcee's moves they had the shortest
 autocorrelation in time on 11 parameters: 65 to 85 steps, the stretch move 106; draws from a
 Student t about the fit 140 to 170, because the data hold products of parameters in a curved valley.

@@ -18,7 +18,7 @@ from hylios_fit.spectra import write_csv
 NAMES = (
     "walker_analog", "nist", "issa", "recovery", "witnesses", "adding_speed", "tissue_speed",
     "walker_speed", "surrogate_speed", "speed_accuracy", "plan", "surrogate_error",
-    "surrogate_choice", "table_noise",
+    "surrogate_choice", "table_noise", "model_error",
 )  # fmt: skip
 
 

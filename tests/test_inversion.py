@@ -311,20 +311,61 @@ def test_a_parameter_pressed_to_the_edge_is_at_bound():
     assert fit["blood_reticular"].low >= LOWER[7]
 
 
-def test_a_misfit_is_called_so_and_widens_what_the_data_tell():
+@pytest.mark.parametrize("smooth", [True, False])
+def test_a_misfit_is_called_so_and_widens_what_the_data_tell(smooth):
     values = reflectance(LIGHT, VISIBLE)[0]
-    wave = 0.02 * np.sin(VISIBLE / 12.0)
-    good, bad = one(values), one(values + wave)
+    smoothly = 0.05**2 * inversion._model_error(VISIBLE, values)
+    missed = np.random.default_rng(0).multivariate_normal(
+        0.0 * values, smoothly if smooth else 0.02**2 * np.eye(VISIBLE.size)
+    )
+    good, bad = one(values), one(values + missed)
     assert good.outcome is Outcome.fitted
-    assert good.inflation == 1.0
+    assert (good.inflation, good.model_error) == (1.0, 0.0)
     assert bad.outcome is Outcome.misfit
-    assert bad.inflation == pytest.approx(np.sqrt(bad.reduced_chi2))
-    assert bad.inflation > 1.5
-    assert any("times what was stated" in message for message in bad.messages)
+    if smooth:
+        assert bad.inflation == 1.0
+        assert 0.015 < bad.model_error < 0.15
+        assert any("the model to miss by" in message for message in bad.messages)
+    else:
+        assert bad.inflation == pytest.approx(np.sqrt(bad.reduced_chi2))
+        assert bad.inflation > 1.5
+        assert bad.model_error == 0.0
+        assert any("times what was stated" in message for message in bad.messages)
     relative = [fit["blood_percent"].sd / fit["blood_percent"].value for fit in (good, bad)]
     assert relative[1] > 1.3 * relative[0]
     # What only the prior tells stays the prior's.
     assert bad["water_percent"].sd == pytest.approx(good["water_percent"].sd, rel=0.02)
+
+
+def test_intervals_hold_their_share_where_the_model_misses():
+    """By a twentieth of the reflectance, which nobody told the fit."""
+    vector = statevector.state_vector(NAMES, LOWER, UPPER)
+    truth = vector.prior_draws(jax.random.key(8), 100)
+    generator = np.random.default_rng(8)
+    measured = np.stack(
+        [
+            generator.multivariate_normal(
+                spectrum, 0.001**2 * np.eye(WIDE.size)
+                + 0.05**2 * inversion._model_error(WIDE, spectrum)
+            )
+            for spectrum in reflectance(truth, WIDE)
+        ]
+    )  # fmt: skip
+    fits = inversion.fit_many(
+        spectra_of(measured, WIDE), TOY, noise=0.001, fix={"melanosome_form": "complex"},
+        progress=False,
+    )  # fmt: skip
+    assert np.mean([fit.model_error > 0.0 for fit in fits]) > 0.95
+    found = np.array([fit.model_error for fit in fits])
+    assert np.median(found) == pytest.approx(0.05, rel=0.15)
+    known = statevector.derived(NAMES, truth)
+    for name in QUANTITIES:
+        inside = [
+            fit[name].low <= value <= fit[name].high
+            for fit, value in zip(fits, known[name], strict=True)
+        ]
+        # 68 % of 100, within 2.4 binomial standard deviations
+        assert np.mean(inside) == pytest.approx(0.68, abs=0.11), name
 
 
 @pytest.mark.parametrize(

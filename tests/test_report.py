@@ -55,6 +55,7 @@ def make_fit(name, seed=0, outcome=Outcome.fitted, wavelength=BANDS, **changes):
         "residual_rms": float(rng.uniform(0.004, 0.02)),
         "reduced_chi2": 1.0345678912345,
         "inflation": 1.0,
+        "model_error": 0.0,
         "iterations": 12,
         "form": "complex",
         "form_probability": {"complex": 0.93, "dispersed": 0.07},
@@ -186,7 +187,8 @@ def test_estimates_have_a_row_for_each_fit(tmp_path, fits):
     for name in (*QUANTITIES, *FREE):
         assert f"{name}_low" in header
         assert f"{name}_high" in header
-    assert header[-5:] == ["inflation", "form", "form_probability", "informed_by_data", "message"]
+    assert header[-6:-3] == ["inflation", "model_error", "form"]
+    assert header[-3:] == ["form_probability", "informed_by_data", "message"]
     rows = read(path)
     assert [row["spectrum"] for row in rows] == [fit.spectrum for fit in fits]
     assert [row["outcome"] for row in rows] == [fit.outcome.code for fit in fits]

@@ -1,0 +1,104 @@
+"""What fits of measured skin take the model to miss: how smooth it is, by the evidence.
+
+NIST's reference spectra (see `nist`), every twelfth, and every 300th of ISSA's (see `issa`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+from unittest import mock
+
+import numpy as np
+
+from experiments import _shared, issa, nist
+from hylios_fit import inversion
+
+LENGTHS = (0.02, 0.05, 0.1, 0.2)
+BANDS = (0.1, 0.01, 0.001)
+EVERY = {"nist": 12, "issa": 300}
+
+
+def run(progress: bool = True) -> dict[str, Any]:
+    """Mean evidence of a spectrum's fit, and its residual, for each length and share of a band,
+    and with the noise inflated instead."""
+    from tqdm import tqdm
+
+    from hylios_fit.spectra import read_spectra
+
+    spectra = {
+        "nist": read_spectra(nist.spectra_path(), wavelength_range=(250.0, 2500.0)),
+        "issa": read_spectra(issa.archive()[0], wavelength_range=(400.0, 700.0)),
+    }
+    chosen = {
+        name: whole.select(range(0, len(whole), EVERY[name])) for name, whole in spectra.items()
+    }
+    kinds = [None, *((length, band) for length in LENGTHS for band in BANDS)]
+    rows = []
+    for kind in tqdm(kinds, unit="kind", disable=not progress):
+        row: dict[str, Any] = {"length": kind and kind[0], "band": kind and kind[1]}
+        for name, part in chosen.items():
+            fits = _fits(part, kind)
+            row[name] = {
+                "evidence": _shared.significant(np.mean([_evidence(fit) for fit in fits]), 6),
+                "residual_rms": _shared.significant(np.median([f.residual_rms for f in fits]), 3),
+                "model_error": _shared.significant(np.median([f.model_error for f in fits]), 3),
+                "melanin_sd": _shared.significant(
+                    np.median([f["melanin_mg_per_mL"].sd / f["melanin_mg_per_mL"].value
+                               for f in fits]), 3,
+                ),
+            }  # fmt: skip
+        rows.append(row)
+    return {
+        "spectra": {name: len(part) for name, part in chosen.items()},
+        "taken": {"length": inversion.MODEL_LENGTH, "band": inversion.MODEL_BAND},
+        "rows": rows,
+    }
+
+
+def _fits(spectra: Any, kind: tuple[float, float] | None) -> list[Any]:
+    instead: dict[str, Any]
+    if kind is None:  # no error of the model: the noise is inflated
+        instead = {"_with_model_error": lambda again, stated, shape, found, target: (found, 0.0)}
+    else:
+        instead = {"MODEL_LENGTH": kind[0], "MODEL_BAND": kind[1]}
+    with mock.patch.multiple(inversion, **instead):
+        fits = inversion.fit_many(spectra, starts=2, progress=False)
+    return [fit for fit in fits if np.isfinite(fit.residual_rms)]
+
+
+def _evidence(fit: Any) -> float:
+    """Log, by Laplace's approximation, for the form that was kept."""
+    used = np.isfinite(np.diag(fit.error_covariance))
+    covariance = fit.error_covariance[np.ix_(used, used)]
+    lower = np.linalg.cholesky(covariance)
+    miss = np.linalg.solve(lower, fit.residual[used])
+    return float(
+        0.5 * np.linalg.slogdet(fit.z_covariance)[1]
+        - 0.5 * (miss @ miss + fit.z @ fit.z)
+        - np.log(np.diag(lower)).sum()
+    )
+
+
+def draw(result: dict[str, Any], path: Any) -> None:
+    """Evidence against length, a curve for each share of a band."""
+    figure = _shared.figure(10, 4.2)
+    titles = {"nist": "NIST, 250 to 2500 nm", "issa": "ISSA, 400 to 700 nm"}
+    for axes, (name, title) in zip(figure.subplots(1, 2), titles.items(), strict=True):
+        inflated, *rows = result["rows"]
+        for band, colour in zip(BANDS, _shared.COLOURS, strict=False):
+            mine = [row for row in rows if row["band"] == band]
+            axes.plot(
+                [row["length"] for row in mine], [row[name]["evidence"] for row in mine],
+                "o-", color=colour, label=f"share of each band {band:g}",
+            )  # fmt: skip
+        axes.axhline(inflated[name]["evidence"], color="black", ls=":", label="noise inflated")
+        axes.axvline(result["taken"]["length"], color="grey", lw=0.8, label="taken")
+        axes.set_xscale("log")
+        axes.set_xticks(LENGTHS, [f"{length:g}" for length in LENGTHS])
+        axes.minorticks_off()
+        axes.legend(fontsize=8)
+        _shared.tidy(
+            axes, "correlation length (logarithm of the wavelength)",
+            "log evidence of a spectrum, mean", f"{title} ({result['spectra'][name]} spectra)",
+        )  # fmt: skip
+    _shared.save_figure(figure, path)
