@@ -14,7 +14,7 @@ from hylios_fit.skin import Specimen
 from hylios_fit.statevector import PRIORS, state_vector
 from hylios_fit.surrogate import Surrogate, load_surrogate
 
-EACH = 256  # specimens of each form and kind
+EACH = 500  # specimens of each form and kind
 SLOPES = 24  # of each form whose derivatives are compared
 GOALS = {"rms": 5e-4, "most": 3e-3, "ciede2000_q99": 0.1, "slopes": 0.01}
 
