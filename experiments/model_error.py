@@ -13,8 +13,8 @@ import numpy as np
 from experiments import _shared, issa, nist
 from hylios_fit import inversion
 
-LENGTHS = (0.02, 0.05, 0.1, 0.2)
-BANDS = (0.1, 0.01, 0.001)
+LENGTHS = (0.03, 0.05, 0.07, 0.1, 0.2)
+BANDS = (0.01, 0.001, 0.0003)
 EVERY = {"nist": 12, "issa": 300}
 
 
@@ -60,7 +60,8 @@ def _fits(spectra: Any, kind: tuple[float, float] | None) -> list[Any]:
     if kind is None:  # no error of the model: the noise is inflated
         instead = {"_with_model_error": lambda again, stated, shape, found, target: (found, 0.0)}
     else:
-        instead = {"MODEL_LENGTH": kind[0], "MODEL_BAND": kind[1]}
+        always = {"NOISE_WITHIN": 1.0 + 1e-9}
+        instead = {"MODEL_LENGTH": kind[0], "MODEL_BAND": kind[1], **always}
     with mock.patch.multiple(inversion, **instead):
         fits = inversion.fit_many(spectra, starts=2, progress=False)
     return [fit for fit in fits if np.isfinite(fit.residual_rms)]

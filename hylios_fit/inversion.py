@@ -10,11 +10,11 @@ S_hat = (K.T K + 1)^-1 with K the Jacobian of the upper part (Laplace). The form
 evidence is kept; the intervals allow for the other one by its probability.
 
 Where the residual is significantly above the stated noise (chi-square, 0.1 %), the fit is repeated
-with one of two reasons for it, the one of higher evidence. Either the noise is understated, by
-sqrt(reduced chi-square). Or the model misses by a share of the reflectance that changes smoothly
-with wavelength (Kennedy and O'Hagan 2001, doi 10.1111/1467-9868.00294), as large as makes
-chi-square what it should be. Intervals of what the data tell widen by it, those of what only the
-prior tells stay the prior's.
+with one of two reasons for it, the more probable one. Either the noise is understated, by
+sqrt(reduced chi-square), where what is stated is trusted to a factor of two. Or the model misses by
+a share of the reflectance that changes smoothly with wavelength (Kennedy and O'Hagan 2001,
+doi 10.1111/1467-9868.00294), as large as makes chi-square what it should be. Intervals of what the
+data tell widen by it, those of what only the prior tells stay the prior's.
 
 Everything runs in float64, whatever JAX's configuration, which is left as it is: LM's stopping
 rule and K.T K lose too much in float32.
@@ -55,9 +55,11 @@ EDGE_PULL = 1.5
 MISFIT_ABOVE = 2.0
 """Reduced chi-square that is called a misfit."""
 SIGNIFICANCE = 1e-3
-MODEL_LENGTH = 0.05
+NOISE_WITHIN = 2.0
+"""Factor that the stated noise is right to (68 %)."""
+MODEL_LENGTH = 0.07
 """Correlation length of the model's own error, in the logarithm of the wavelength (Matern 3/2)."""
-MODEL_BAND = 0.001
+MODEL_BAND = 0.0003
 """Share of its variance that each band has on its own."""
 MODEL_FLOOR = 0.02
 """Reflectance below which it gets no smaller."""
@@ -520,7 +522,8 @@ def _inverted(job: _Job, wavelength_nm: np.ndarray, measured: np.ndarray, name: 
         noisier = again({form: covariance * reduced for form, covariance in stated.items()})
         shape = _model_error(wavelength_nm[job.usable], level[job.usable])
         smooth, share = _with_model_error(again, stated, shape, found, target)
-        if _evidence(smooth).max() > _evidence(noisier).max():
+        unlikely = 0.5 * (0.5 * np.log(reduced) / np.log(NOISE_WITHIN)) ** 2
+        if _evidence(smooth).max() > _evidence(noisier).max() - unlikely:
             found, model_error = smooth, share
         else:
             found, inflation = noisier, float(np.sqrt(reduced))
@@ -535,7 +538,7 @@ def _inverted(job: _Job, wavelength_nm: np.ndarray, measured: np.ndarray, name: 
 def _model_error(wavelength_nm: np.ndarray, level: np.ndarray) -> np.ndarray:
     """(B, B) covariance of what the model misses, as a share of the reflectance, where that is 1.
 
-    Length and share of each band are those of the highest evidence over fits of measured skin
+    Length and share of each band have about the highest evidence over fits of measured skin
     (`python -m experiments model_error`).
     """
     level = np.maximum(level, MODEL_FLOOR)
