@@ -9,12 +9,12 @@ Levenberg-Marquardt minimises it from several starts, for each form of the melan
 S_hat = (K.T K + 1)^-1 with K the Jacobian of the upper part (Laplace). The form of the higher
 evidence is kept; the intervals allow for the other one by its probability.
 
-Where the residual is significantly above the stated noise (chi-square, 0.1 %), the fit is repeated
-with one of two reasons for it, the more probable one. Either the noise is understated, by
-sqrt(reduced chi-square), where what is stated is trusted to a factor of 1.5. Or the model misses by
-a share of the reflectance that changes smoothly with wavelength (Kennedy and O'Hagan 2001,
-doi 10.1111/1467-9868.00294), as large as makes chi-square what it should be. Intervals of what the
-data tell widen by it, those of what only the prior tells stay the prior's.
+Where the residual is significantly above the noise (chi-square, 0.1 %), the fit is repeated. The
+model is taken to miss by a share of the reflectance that changes smoothly with wavelength (Kennedy
+and O'Hagan 2001, doi 10.1111/1467-9868.00294), as large as makes chi-square what it should be. Or,
+if the noise was stated and that is more probable, the noise is taken to be understated, by
+sqrt(reduced chi-square); the default, which is that of repeats on skin, is not doubted. Intervals
+of what the data tell widen by it, those of what only the prior tells stay the prior's.
 
 Everything runs in float64, whatever JAX's configuration, which is left as it is: LM's stopping
 rule and K.T K lose too much in float32.
@@ -56,7 +56,7 @@ MISFIT_ABOVE = 2.0
 """Reduced chi-square that is called a misfit."""
 SIGNIFICANCE = 1e-3
 NOISE_WITHIN = 1.5
-"""Factor that the stated noise is right to (68 %)."""
+"""Factor that a stated noise is right to (68 %)."""
 MODEL_LENGTH = 0.05
 """Correlation length of the model's own error, in the logarithm of the wavelength (Matern 3/2)."""
 MODEL_BAND = 0.01
@@ -519,14 +519,14 @@ def _inverted(job: _Job, wavelength_nm: np.ndarray, measured: np.ndarray, name: 
     reduced, significant = _reduced_chi2(found[np.argmax(_evidence(found))], target)
     inflation, model_error = 1.0, 0.0
     if significant:
-        noisier = again({form: covariance * reduced for form, covariance in stated.items()})
         shape = _model_error(wavelength_nm[job.usable], level[job.usable])
-        smooth, share = _with_model_error(again, stated, shape, found, target)
-        unlikely = 0.5 * (0.5 * np.log(reduced) / np.log(NOISE_WITHIN)) ** 2
-        if _evidence(smooth).max() > _evidence(noisier).max() - unlikely:
-            found, model_error = smooth, share
-        else:
-            found, inflation = noisier, float(np.sqrt(reduced))
+        smooth, model_error = _with_model_error(again, stated, shape, found, target)
+        if not job.noise_follows_reflectance:
+            noisier = again({form: covariance * reduced for form, covariance in stated.items()})
+            unlikely = 0.5 * (0.5 * np.log(reduced) / np.log(NOISE_WITHIN)) ** 2
+            if _evidence(noisier).max() - unlikely > _evidence(smooth).max():
+                smooth, model_error, inflation = noisier, 0.0, float(np.sqrt(reduced))
+        found = smooth
     evidence = _evidence(found)
     weights = np.exp(evidence - evidence.max())
     return _fit_from(
