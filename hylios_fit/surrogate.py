@@ -583,14 +583,14 @@ def check_report(surrogate: Surrogate) -> str:
         values = [float(np.sqrt(np.mean(error[f][use] ** 2))) for f in surrogate.forms]
         bands.append((max(values), f"  {low:5d} to {high:5d}      ", values))
     for _, label, values in bands:
-        lines.append(label + "".join(f"{v:12.4f}" for v in values))
+        lines.append(label + "".join(f"{v:12.5f}" for v in values))
     worst = max(bands)
-    lines += ["", f"worst band:{worst[1].rstrip()} nm, {worst[0]:.4f}"]
+    lines += ["", f"worst band:{worst[1].rstrip()} nm, {worst[0]:.5f}"]
     whole = [float(np.sqrt(np.mean(error[f] ** 2))) for f in surrogate.forms]
-    lines.append("whole range           " + "".join(f"{v:12.4f}" for v in whole))
+    lines.append("whole range           " + "".join(f"{v:12.5f}" for v in whole))
     most = about["held_out_most"]
     lines.append("99.9 % of all within  " + "".join(f"{most[f]:12.4f}" for f in surrogate.forms))
     for form in surrogate.forms:
         lines += ["", f"by region of the box, {form}, worst first (RMS, largest):"]
-        lines += [f"  {text:46s}{rms:8.4f}{top:9.4f}" for text, rms, top in about["regions"][form]]
+        lines += [f"  {text:46s}{rms:9.5f}{top:9.4f}" for text, rms, top in about["regions"][form]]
     return "\n".join(lines)
