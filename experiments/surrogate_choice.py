@@ -198,9 +198,9 @@ def draw(result: dict[str, Any], path: Any) -> None:
         left.axhline(result["local"][kind], color=colour, ls=":", lw=1)
     _shared.logarithmic(left.xaxis)
     left.set_yscale("log")
-    left.set_ylim(bottom=1e-4)
+    left.set_ylim(bottom=4e-5)
     left.tick_params(axis="x", labelsize=8, rotation=30)
-    left.legend(fontsize=7)
+    left.legend(fontsize=7, loc="lower left")
     title = "dotted: what they learned from"
     _shared.tidy(left, "products for three bands", "RMS error of the reflectance", title)
     points = result["truncated"]
