@@ -768,12 +768,15 @@ def _data_uri(figure: Any, kind: str = "svg", dpi: int = 110, tight: bool = Fals
 
 
 def _spectrum_figure(one: _Shown) -> str:
-    """Measured against fitted, and below it the residual with the band of what was expected."""
+    """Measured against fitted, and below it the residual, with the band of what was expected and
+    the wider one that the intervals allow for."""
     from matplotlib import rc_context
 
     kept = np.isfinite(one.measured)
     wavelength, measured = one.wavelength_nm[kept], one.measured[kept]
     fitted, sd = one.fitted[kept], one.sd[kept]
+    allowed = np.hypot(_round(one.fit.inflation) * sd, _round(one.fit.model_error) * fitted)
+    wider = one.fit.inflation > 1.0 or one.fit.model_error > 0.0
     has_fit = bool(np.isfinite(fitted).any())
     few = wavelength.size <= 80
     with rc_context(_STYLE):
@@ -785,6 +788,11 @@ def _spectrum_figure(one: _Shown) -> str:
         else:
             top, bottom = figure.subplots(), None
         if has_fit:
+            if wider:
+                top.fill_between(
+                    wavelength, fitted - allowed, fitted + allowed, color=_BAND, alpha=0.15,
+                    linewidth=0, label="as the intervals allow",
+                )  # fmt: skip
             top.fill_between(
                 wavelength, fitted - sd, fitted + sd, color=_BAND, alpha=0.35, linewidth=0,
                 label="±1 sd of noise and surrogate error",
@@ -803,6 +811,10 @@ def _spectrum_figure(one: _Shown) -> str:
         lowest_axes = top
         if bottom is not None:
             residual = measured - fitted
+            if wider:
+                bottom.fill_between(
+                    wavelength, -allowed, allowed, color=_BAND, alpha=0.15, linewidth=0
+                )
             bottom.fill_between(wavelength, -sd, sd, color=_BAND, alpha=0.35, linewidth=0)
             bottom.axhline(0, color=_FIT, linewidth=0.9)
             bottom.plot(wavelength, residual, color=_INK, linewidth=0.9)
