@@ -45,7 +45,7 @@ def test_a_saved_result_names_its_origin_and_is_all_that_the_figure_needs(name, 
     assert record["experiment"] == name
     assert {"seed", "python", "seconds", "result"} <= record.keys()
     module = importlib.import_module(f"experiments.{name}")
-    assert (record["seed"] is None) == (name == "nist"), "only fits of NIST's draw nothing"
+    assert (record["seed"] is None) == (name in ("nist", "model_error")), "they draw nothing"
     assert {"hylios_fit", "jax", "numpy", "optimistix"} <= record["versions"].keys()
     assert record["device"]
     assert len(record["commit"].split("+")[0]) == 40
