@@ -52,6 +52,7 @@ FURTHER = {"index_dispersion": (-0.005, 0.035)}
 LOCAL_HIDDEN = (128, 128, 128)
 LOCAL_STEPS = 40_000
 LOCAL_BATCH = 2048
+ALIKE = 100.0  # entries of a walked table whose noise is as good as one: they share paths
 TRUST = 1e-3  # error of the logarithm that rows without noise are learned to, about
 SPECIMENS = 131_072  # of each form, that the local regression answers for
 COMPONENTS = 80
@@ -313,7 +314,7 @@ def learn_locally(
     weight, variance = None, float(noise.mean()) / unit**2
     if table.attrs["generator"] == "walker":  # the errors of `adding` are no noise
         weight = (1.0 / (noise + TRUST**2)).reshape(-1)
-        variance = 1.0 / float(weight.mean()) / unit**2
+        variance = ALIKE / float(weight.mean()) / unit**2
         weight /= weight.mean()
     x -= centre
     x /= scale
