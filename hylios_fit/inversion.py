@@ -521,7 +521,7 @@ def _inverted(job: _Job, wavelength_nm: np.ndarray, measured: np.ndarray, name: 
     if significant:
         shape = _model_error(wavelength_nm[job.usable], level[job.usable])
         smooth, model_error = _with_model_error(again, stated, shape, found, target)
-        if not job.noise_follows_reflectance:
+        if not job.noise_follows_reflectance:  # somebody stated it
             noisier = again({form: covariance * reduced for form, covariance in stated.items()})
             unlikely = 0.5 * (0.5 * np.log(reduced) / np.log(NOISE_WITHIN)) ** 2
             if _evidence(noisier).max() - unlikely > _evidence(smooth).max():
@@ -557,13 +557,13 @@ def _with_model_error(
     """The fits that allow for an error of the model, and its share of the reflectance: that which
     makes the reduced chi-square 1."""
     best = found[np.argmax(_evidence(found))]
-    share = np.sqrt(np.nanmean((best.spectrum - target) ** 2 / np.diag(shape)))
+    share, reduced = np.sqrt(np.nanmean((best.spectrum - target) ** 2 / np.diag(shape))), 1.0
     for _ in range(MODEL_STEPS):
+        share *= np.sqrt(reduced)
         found = again({form: part + share**2 * shape for form, part in stated.items()})
         reduced, _ = _reduced_chi2(found[np.argmax(_evidence(found))], target)
         if abs(reduced - 1.0) < MODEL_WITHIN:
             break
-        share *= np.sqrt(reduced)
     return found, float(share)
 
 
