@@ -77,8 +77,7 @@ def _fits(spectra: Any, free: Any, kind: tuple[float, float] | None) -> list[Any
 
 def _inflated(again: Any, stated: Any, shape: Any, found: Any, target: Any) -> tuple[Any, float]:
     """The noise understated, in the place of an error of the model."""
-    best = found[np.argmax(inversion._evidence(found))]
-    reduced, _ = inversion._reduced_chi2(best, target)
+    reduced, _ = inversion._reduced_chi2(inversion._best(found), target)
     return again({form: covariance * reduced for form, covariance in stated.items()}), 0.0
 
 

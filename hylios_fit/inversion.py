@@ -511,12 +511,12 @@ def _inverted(job: _Job, wavelength_nm: np.ndarray, measured: np.ndarray, name: 
 
     # An error that scales with the measured value weighs low readings more, and so pulls the fit
     # down (Peelle's puzzle): take it at the fitted value.
-    level[job.usable] = found[np.argmax(_evidence(found))].spectrum
+    level[job.usable] = _best(found).spectrum
     if job.noise_follows_reflectance:
         noise = job.noise(level)[np.ix_(job.usable, job.usable)]
     stated = _stated(job, noise, level)
     found = again(stated)
-    reduced, significant = _reduced_chi2(found[np.argmax(_evidence(found))], target)
+    reduced, significant = _reduced_chi2(_best(found), target)
     inflation, model_error = 1.0, 0.0
     if significant:
         shape = _model_error(wavelength_nm[job.usable], level[job.usable])
@@ -556,12 +556,12 @@ def _with_model_error(
 ) -> tuple[list[_Solution], float]:
     """The fits that allow for an error of the model, and its share of the reflectance: that which
     makes the reduced chi-square 1."""
-    best = found[np.argmax(_evidence(found))]
+    best = _best(found)
     share, reduced = np.sqrt(np.nanmean((best.spectrum - target) ** 2 / np.diag(shape))), 1.0
     for _ in range(MODEL_STEPS):
         share *= np.sqrt(reduced)
         found = again({form: part + share**2 * shape for form, part in stated.items()})
-        reduced, _ = _reduced_chi2(found[np.argmax(_evidence(found))], target)
+        reduced, _ = _reduced_chi2(_best(found), target)
         if abs(reduced - 1.0) < MODEL_WITHIN:
             break
     return found, float(share)
@@ -586,6 +586,10 @@ def _evidence(found: list[_Solution]) -> np.ndarray:
             for s in found
         ]
     )
+
+
+def _best(found: list[_Solution]) -> _Solution:
+    return found[np.argmax(_evidence(found))]
 
 
 def _s_hat(k: np.ndarray) -> np.ndarray:
