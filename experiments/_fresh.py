@@ -42,8 +42,7 @@ def solved(names: tuple[str, ...], form: str, rows: np.ndarray, progress: bool) 
     """(n, w) by adding-doubling."""
     from tqdm import tqdm
 
-    total = len(rows)
-    with tqdm(total=total, desc=form, unit="specimen", disable=not progress) as bar:
+    with tqdm(total=len(rows), desc=form, unit="specimen", disable=not progress) as bar:
         return training.solved(names, form, rows, bar)
 
 

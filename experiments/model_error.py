@@ -84,14 +84,10 @@ def _inflated(again: Any, stated: Any, shape: Any, found: Any, target: Any) -> t
 def _evidence(fit: Any) -> float:
     """Log, by Laplace's approximation, for the form that was kept."""
     used = np.isfinite(np.diag(fit.error_covariance))
-    covariance = fit.error_covariance[np.ix_(used, used)]
-    lower = np.linalg.cholesky(covariance)
-    miss = np.linalg.solve(lower, fit.residual[used])
-    return float(
-        0.5 * np.linalg.slogdet(fit.z_covariance)[1]
-        - 0.5 * (miss @ miss + fit.z @ fit.z)
-        - np.log(np.diag(lower)).sum()
-    )
+    weights, log_determinant = inversion.whitener(fit.error_covariance, used)
+    miss = weights @ np.where(used, fit.residual, 0.0)
+    volume = 0.5 * np.linalg.slogdet(fit.z_covariance)[1]
+    return float(volume - 0.5 * (miss @ miss + fit.z @ fit.z) - log_determinant)
 
 
 def draw(result: dict[str, Any], path: Any) -> None:

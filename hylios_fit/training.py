@@ -394,12 +394,11 @@ def specimens(table: Any, seed: int, count: int | None = None) -> np.ndarray:
     return np.concatenate([over, *prior])
 
 
-def fit(x: np.ndarray, log: np.ndarray, network: Any = None) -> dict[str, np.ndarray]:
+def fit(x: np.ndarray, log: np.ndarray, network: Any) -> dict[str, np.ndarray]:
     """Standardise, reduce, regress: features (n, f), and what they give (n, w).
 
-    The network is scikit-learn's `MLPRegressor` or like it, not fitted yet; by default a
-    `Perceptron` of `HIDDEN` units and `STEPS`. Returns every number of what the surrogate
-    evaluates, by name.
+    The network is a `Perceptron`, or another with `coefs_` and `intercepts_`, not fitted yet.
+    Returns every number of what the surrogate evaluates, by name.
     """
     from sklearn.decomposition import PCA
     from sklearn.preprocessing import StandardScaler
@@ -410,7 +409,6 @@ def fit(x: np.ndarray, log: np.ndarray, network: Any = None) -> dict[str, np.nda
     pca: Any = PCA(min(COMPONENTS, len(x) // 4), random_state=0).fit(log)
     scores = pca.transform(log)
     unit = scores[:, 0].std()  # one scale for all, so that what matters more weighs more
-    network = network or Perceptron(HIDDEN, STEPS, BATCH)
     network.fit(scaler.transform(x), scores / unit)
     weights, biases = (
         [*parts[:-1], parts[-1] * unit] for parts in (network.coefs_, network.intercepts_)
