@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
 from experiments import _fresh, _shared
-from hylios_fit import adding, training
+from hylios_fit import training
 from hylios_fit.appearance import appearances, colour_differences
-from hylios_fit.skin import Specimen
-from hylios_fit.statevector import PRIORS, state_vector
+from hylios_fit.statevector import state_vector
 from hylios_fit.surrogate import Surrogate, load_surrogate
 
 EACH = 500  # specimens of each form and kind
+KINDS = ("usual", "every", "bare")
+BARE = ("melanosome_granulosum", "melanosome_spinosum")
+BARE_SHARE = 5  # so many times fewer of the last kind
 SLOPES = 24  # of each form whose derivatives are compared
+MODULES = ("training", "table", "skin", "adding", "streams", "statevector")
 GOALS = {"rms": 5e-4, "most": 3e-3, "ciede2000_q99": 0.1, "slopes": 0.01}
 
 
@@ -27,7 +32,8 @@ def run(
     progress: bool = True,
 ) -> dict[str, Any]:
     """Fresh specimens from the prior, with the pigments, blood, water and lipids free and the rest
-    at the model's values, as in a usual fit; and with every parameter free."""
+    at the model's values, as in a usual fit; with every parameter free; and as the first, without
+    melanosomes in the upper strata, as light skin has them and the prior of the fits never."""
     surrogate = surrogate or load_surrogate()
     nm = surrogate.wavelength_nm
     found: dict[str, Any] = {
@@ -37,19 +43,28 @@ def run(
         "wavelength_nm": nm.tolist(),
         "kinds": {},
     }
-    for number, kind in enumerate(("usual", "every")):
+    names = surrogate.at(surrogate.forms[0]).names
+    folder = _shared.checkpoint("surrogate_error", MODULES, seed=seed, names=names)
+    for number, kind in enumerate(KINDS):
         parts = {}
         for form in surrogate.forms:
             member = surrogate.at(form)
             key = jax.random.fold_in(jax.random.key(seed), 100 + number)
-            free = ("usual",) if kind == "usual" else member.names
-            rows = training.fresh(member.names, member.lower, member.upper, each, key, free)
-            truth = _fresh.solved(member.names, form, rows, progress)
+            free = member.names if kind == "every" else ("usual",)
+            count = each // BARE_SHARE if kind == "bare" else each
+            rows = training.fresh(member.names, member.lower, member.upper, count, key, free)
+            if kind == "bare":
+                rows[:, [member.names.index(name) for name in BARE]] = 0.0
+            solve = partial(_fresh.solved, member.names, form, rows, progress)
+            kept = folder / f"{kind}_{form}_{count}.npz"
+            truth = _shared.kept_arrays(kept, lambda f=solve: {"truth": f()})["truth"]
             parts[form] = np.asarray(member(rows.astype(np.float32)), float), truth
         told = {form: _errors(nm, *pair) for form, pair in parts.items()}
         every = [np.concatenate(part) for part in zip(*parts.values(), strict=True)]
         found["kinds"][kind] = {"both": _errors(nm, *every), **told}
-    found["slopes"] = {form: _slopes(surrogate, form, slopes, seed) for form in surrogate.forms}
+    found["slopes"] = {
+        form: _slopes(surrogate, form, slopes, seed, folder) for form in surrogate.forms
+    }
     return found
 
 
@@ -72,20 +87,18 @@ def _errors(nm: np.ndarray, found: np.ndarray, truth: np.ndarray) -> dict[str, A
     }
 
 
-def _slopes(surrogate: Surrogate, form: str, count: int, seed: int) -> dict[str, Any]:
+def _slopes(surrogate: Surrogate, form: str, count: int, seed: int, folder: Path) -> dict[str, Any]:
     """RMS difference over RMS of the derivatives by each usual parameter, scaled by its range."""
     member = surrogate.at(form)
-    names = tuple(name for name in member.names if PRIORS[name].usual)
     vector = state_vector(member.names, member.lower, member.upper)
     rows = vector.prior_draws(jax.random.fold_in(jax.random.key(seed), 200), count)
+    solve = partial(training.solve_slopes, member.names, form, rows)
+    kept = folder / f"slopes_{form}_{count}.npz"
+    exact = _shared.kept_arrays(kept, lambda: solve()._asdict())
+    names, true = [str(name) for name in exact["by"]], exact["slopes"]
     own = jax.jit(jax.vmap(jax.jacfwd(member._evaluate)))(rows.astype(np.float32))
     place = [member.names.index(name) for name in names]
     own = np.moveaxis(np.asarray(own, float)[..., place], -1, 1)
-    true = []
-    for row in rows:
-        specimen = Specimen(dict(zip(member.names, row.tolist(), strict=True)), form)
-        true.append(np.asarray(adding.slopes(specimen, member.wavelength_nm, names)[1], float))
-    true = np.array(true)
     off = np.sqrt(np.mean((own - true) ** 2, axis=(0, 2)))
     size = np.sqrt(np.mean(true**2, axis=(0, 2)))
     return dict(zip(names, _shared.significant(off / size, 3), strict=True))
@@ -96,7 +109,11 @@ def draw(result: dict[str, Any], path: Any) -> None:
     figure = _shared.figure(11, 4.8)
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
     nm = np.array(result["wavelength_nm"])
-    labels = {"usual": "pigments, blood, water, lipids free", "every": "every parameter free"}
+    labels = {
+        "usual": "pigments, blood, water, lipids free",
+        "every": "every parameter free",
+        "bare": "the first, upper strata without melanosomes",
+    }
     for (kind, told), colour in zip(result["kinds"].items(), _shared.COLOURS, strict=False):
         both = told["both"]
         label = f"{labels[kind]}: RMS {both['rms']:.1e}"
@@ -105,8 +122,8 @@ def draw(result: dict[str, Any], path: Any) -> None:
     left.axhline(result["goals"]["rms"], color="black", ls="--", lw=0.8)
     left.set_yscale("log")
     left.legend(fontsize=8)
-    number = 2 * result["kinds"]["usual"]["complex"]["specimens"]
-    title = f"{number} fresh specimens each; dotted: 99 % lie below"
+    numbers = ", ".join(str(told["both"]["specimens"]) for told in result["kinds"].values())
+    title = f"{numbers} fresh specimens; dotted: 99 % lie below"
     _shared.tidy(left, "wavelength (nm)", "error of the reflectance", title)
     for (form, found), colour in zip(result["slopes"].items(), _shared.COLOURS[2:], strict=False):
         right.barh(

@@ -54,11 +54,20 @@ class Perceptron(RegressorMixin, BaseEstimator):
         self.seed = seed
         self.bar = bar
 
-    def fit(self, x: Any, y: Any, sample_weight: Any = None) -> Perceptron:
-        """Inputs (n, f), standardised, and targets (n, k) of about unit size; weights (n,)."""
+    def fit(
+        self, x: Any, y: Any, sample_weight: Any = None, along: tuple[Any, Any] | None = None
+    ) -> Perceptron:
+        """Inputs (n, f), standardised, and targets (n, k) of about unit size; weights (n,).
+
+        `along` are how both change, (n, f) and (n, k), along one direction at each example: then
+        the slope there is learned too (Czarnecki et al. 2017, arXiv:1706.04859).
+        """
         x, y = jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32)
         weight = jnp.asarray(np.ones(len(x)) if sample_weight is None else sample_weight)
         data = _Data(x, y, weight.astype(jnp.float32))
+        if along is not None:
+            dx, dy = along
+            data = data._replace(dx=jnp.asarray(dx, jnp.float32), dy=jnp.asarray(dy, jnp.float32))
         first, batches = jax.random.split(jax.random.key(self.seed))
         widths = (x.shape[1], *self.hidden, y.shape[1])
         layers = tuple(
@@ -81,15 +90,21 @@ class Perceptron(RegressorMixin, BaseEstimator):
 
     def predict(self, x: Any) -> np.ndarray:
         """Targets (n, k) at inputs (n, f)."""
+        return np.asarray(jax.jit(self.answer)(jnp.asarray(x, jnp.float32)))
+
+    def answer(self, x: Float[Array, "... f"]) -> Float[Array, "... k"]:
+        """As `predict`, in JAX."""
         pairs = zip(self.coefs_, self.intercepts_, strict=True)
         matrices = [jnp.concatenate([w, b[None]]) for w, b in pairs]
-        return np.asarray(_answer(matrices, jnp.asarray(x, jnp.float32)))
+        return _forward(matrices, x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], -1)
 
 
 class _Data(NamedTuple):
     x: Float[Array, "n f"]
     y: Float[Array, "n k"]
     weight: Float[Array, "n"]
+    dx: Float[Array, "n f"] | None = None
+    dy: Float[Array, "n k"] | None = None
 
 
 class _Layer(NamedTuple):
@@ -119,12 +134,15 @@ def _forward(matrices: list[Array], x: Float[Array, "n f"]) -> Float[Array, "n k
     return x
 
 
-_answer = jax.jit(_forward)
 _times = partial(jnp.matmul, precision="highest")
 
 
 def _loss(matrices: list[Array], data: _Data, penalty: Array) -> Array:
-    error = jnp.sum((_forward(matrices, data.x) - data.y) ** 2, axis=1)
+    if data.dx is None:
+        error = jnp.sum((_forward(matrices, data.x) - data.y) ** 2, axis=1)
+    else:
+        y, dy = jax.jvp(partial(_forward, matrices), (data.x,), (data.dx,))
+        error = jnp.sum((y - data.y) ** 2 + (dy - data.dy) ** 2, axis=1)
     weights = sum(jnp.sum(matrix[:-1] ** 2) for matrix in matrices)
     return 0.5 * (jnp.mean(data.weight * error) + penalty * weights)
 
@@ -139,7 +157,7 @@ def _descend(
 
     def step(number: Array, layers: tuple[_Layer, ...]) -> tuple[_Layer, ...]:
         chosen = jax.random.randint(jax.random.fold_in(key, number), (batch,), 0, len(data.x))
-        drawn = _Data(*(part[chosen] for part in data))
+        drawn = jax.tree.map(lambda part: part[chosen], data)
         gradients = jax.grad(_loss)([layer.matrix for layer in layers], drawn, penalty)
         count = number.astype(jnp.float32) + 1.0
         done = count / (whole.astype(jnp.float32) * TURN)

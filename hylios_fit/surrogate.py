@@ -31,7 +31,7 @@ from hylios_fit.errors import HyliosError
 from hylios_fit.skin import LAYERS, SPECS, STRATA, Specimen
 
 FORMAT = "hylios_fit surrogate"
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 FLOOR = 0.3
 """Added to the subsurface reflectance before the logarithm: errors are less than relative."""
 
@@ -46,6 +46,8 @@ OFFSETS = {
     "reticular_scattering": 2.0,
     **dict.fromkeys((f"thickness_{layer}" for layer in LAYERS), 0.0),
 }
+FIRST = 0.002
+"""Melanosomes (%) that free the light which total reflection keeps in an epidermis without any."""
 FEATURES_NM = np.array(
     [255, 285, 320, 380, 415, 435, 460, 500, 545, 576, 600, 630, 760, 900, 1200, 1450, 1930, 2300.0]
 )
@@ -60,14 +62,16 @@ PRECISION = "highest"  # some accelerators multiply float32 with 10 bits unless 
 def features(
     names: tuple[str, ...], form: str, parameters: Float[Array, "... p"]
 ) -> Float[Array, "... f"]:
-    """What the regression sees, before standardising: each parameter, and the logarithms of the
-    optical depth (absorption) of epidermis, papillary and reticular dermis at `FEATURES_NM`."""
+    """What the regression sees, before standardising: each parameter, whether there are any
+    melanosomes, and the logarithms of the optical depth (absorption) of epidermis, papillary and
+    reticular dermis at `FEATURES_NM`."""
     if parameters.ndim > 1:
         rows = parameters.reshape(-1, len(names))
         found = jax.vmap(lambda row: features(names, form, row))(rows)
         return found.reshape(*parameters.shape[:-1], -1)
     at = {name: parameters[i] for i, name in enumerate(names)}
     own = [jnp.log(x + OFFSETS[name]) if name in OFFSETS else x for name, x in at.items()]
+    own += [at[name] / (at[name] + FIRST) for name in at if name.startswith("melanosome_")]
     v = {**Specimen().values, **at}
     v = {name: jnp.asarray(value, parameters.dtype) for name, value in v.items()}
     melanin = skin.melanin_coefficient(v, FEATURES_NM, parameters.dtype)

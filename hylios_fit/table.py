@@ -31,7 +31,7 @@ import numpy as np
 
 from hylios_fit import fresnel, skin, tally, walker
 from hylios_fit.errors import HyliosError
-from hylios_fit.skin import SPECS, Layers, Specimen
+from hylios_fit.skin import SPECS, STRATA, Layers, Specimen
 
 if TYPE_CHECKING:
     import xarray
@@ -117,6 +117,7 @@ def of_indices(names: Iterable[str]) -> np.ndarray:
 INDICES = of_indices(NAMES)
 USUAL = NAMES.index("lipids") + 1  # pigments, blood, water, lipids
 PLAIN = 5
+BARE = 3
 SHIFT = (-0.04, 0.12)
 """The refractive indices of a row are moved together by as much as `index_dispersion` moves them
 within the spectrum: so the table knows what that does without a spectrum of indices in each row."""
@@ -136,7 +137,7 @@ def design(rows: int, seed: int = 0, generator: str = "walker") -> tuple[np.ndar
     rows of a larger table are those of a smaller one. Rows of a group agree in what changes paths
     (`walker`), or in the indices, which the streams depend on (`adding`). Every `PLAIN`-th group is
     of the model as published, where the first `USUAL` parameters alone move: an edge of the box,
-    and what is asked for most.
+    and what is asked for most. Every `BARE`-th is `bared`.
     """
     groups = -(-rows // (SHARE * len(FORMS)))
     plain = np.arange(groups) % PLAIN == PLAIN - 1
@@ -147,9 +148,21 @@ def design(rows: int, seed: int = 0, generator: str = "walker") -> tuple[np.ndar
     values[np.ix_(~plain, np.arange(SHARE), INDICES)] += shift[:, None, None]
     some = np.arange(USUAL)
     values[plain, :, :USUAL] = _groups(int(np.sum(plain)), some, together, seed, 2)[0]
+    values = bared(values)
     both = np.repeat(values[:, None], len(FORMS), axis=1).reshape(-1, len(NAMES))
     form = np.arange(len(both)) // SHARE % len(FORMS)
     return both[:rows], form[:rows]
+
+
+def bared(values: np.ndarray) -> np.ndarray:
+    """Parameters (n, ..., P), every `BARE`-th of the n without melanosomes in the uppermost one,
+    two or three strata in turn: light skin has none there (Szabo et al. 1969), vitiligo nowhere."""
+    number = np.arange(len(values))
+    strata = np.where(number % BARE == BARE - 1, number // BARE % len(STRATA) + 1, 0)
+    values = values.copy()
+    for i, stratum in enumerate(STRATA):
+        values[strata > i, ..., NAMES.index(f"melanosome_{stratum}")] = 0.0
+    return values
 
 
 def _groups(

@@ -2,10 +2,12 @@
 
 A wavelength knows of a specimen only what its layers absorb and scatter there: some twenty numbers.
 So the table is first learned as a function of those, all wavelengths of all rows together, which
-makes millions of examples of it (`learn_locally`). That function then answers for as many more
-specimens as the regression on the principal components (`fit`) needs, at the cost of a product of
-matrices each, and for parameters that act through the layers alone whether or not the table has an
-axis for them (`index_dispersion`).
+makes millions of examples of it (`learn_locally`). Of a table by `adding` it learns more: slopes of
+a few specimens, of which each tells as much as many rows, and what a finer order changes
+(`solve_finer`). That function then answers for as many more specimens as the regression on the
+principal components (`fit`) needs, with its slopes, at the cost of a product of matrices each, and
+for parameters that act through the layers alone whether or not the table has an axis for them
+(`index_dispersion`).
 """
 
 from __future__ import annotations
@@ -15,14 +17,14 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hylios_fit import fresnel
+from hylios_fit import adding, fresnel
 from hylios_fit.perceptron import STAGES, Perceptron
 from hylios_fit.skin import LAYERS, Layers, Specimen
 from hylios_fit.statevector import PRIORS, derived, state_vector
@@ -36,7 +38,10 @@ from hylios_fit.surrogate import (
     save,
 )
 from hylios_fit.table import (
+    ADDING_ORDER,
     USUAL,
+    WAVELENGTHS,
+    bared,
     forms_of,
     layers_of,
     of_indices,
@@ -49,16 +54,23 @@ from hylios_fit.threads import one_blas_thread
 
 FURTHER = {"index_dispersion": (-0.005, 0.035)}
 """Ranges of parameters that the table has no axis for and its indices cover."""
+FIRST = 3e-3
+"""Hits in a straight pass that free the light which total reflection keeps in a clear epidermis."""
 LOCAL_HIDDEN = (128, 128, 128)
 LOCAL_STEPS = 40_000
 LOCAL_BATCH = 2048
 ALIKE = 100.0  # entries of a walked table whose noise is as good as one: they share paths
 TRUST = 1e-3  # error of the logarithm that rows without noise are learned to, about
+FINE_ORDER = 12  # of slopes, and of what else is solved more finely
+FINE = 256  # specimens of each form that are solved at both orders
+ORDER_STEPS = 4000
+STEEP = 256  # specimens of each form whose slopes are solved
+WAYS = 4  # in which each of them is looked at
 SPECIMENS = 131_072  # of each form, that the local regression answers for
 COMPONENTS = 80
 HIDDEN = (192, 128, 128)
 STEPS = 80_000
-BATCH = 2048
+BATCH = 1024
 LEAST_ROWS = 64  # of each form
 CHECK_ORDER = 8  # of the solver that they are held against
 TOGETHER = 16  # of them have the same refractive indices
@@ -230,6 +242,7 @@ def local_features(layers: Layers) -> Float[Array, "w f"]:
     guess = _two_fluxes(layers)
     rows = [
         jnp.log(absorbed + 1e-3), jnp.sqrt(absorbed + 1e-4), jnp.log(hits + 0.05),
+        hits / (hits + FIRST),
         jnp.log(lost + 1e-3), jnp.log(hits * lost + 1e-3), layers.theta_0[None],
         jnp.log(fibre + 0.02)[None], jnp.log(tissue + 0.1)[None], jnp.sqrt(tissue + 0.01)[None],
         layers.bottom * jnp.ones_like(tissue)[None], index, steps,
@@ -290,48 +303,191 @@ def _inputs(names: tuple[str, ...], form: str) -> Callable[[Array], Float[Array,
     return jax.jit(lambda rows: jax.vmap(local_features)(of(rows)))
 
 
-def learn_locally(
-    table: Any, form: str, seed: int = 0, bar: Any = None, steps: int | None = None
-) -> Callable[[tuple[str, ...], np.ndarray], np.ndarray]:
-    """The local regression of a table's rows (`read_table`) of one form.
+class Slopes(NamedTuple):
+    """Specimens, and how their reflectance changes with some of the parameters."""
 
-    What it returns takes names (P) and parameters (n, P), and gives the logarithm (n, w) of the
-    light from inside, plus `FLOOR`, as a share of what entered. `bar` counts the stages; `steps`
-    of the optimiser, `LOCAL_STEPS` if None.
+    names: tuple[str, ...]  # of the parameters (P)
+    rows: Float[np.ndarray, "n P"]
+    reflectance: Float[np.ndarray, "n w"]
+    by: tuple[str, ...]  # the parameters (p) that it changes with
+    slopes: Float[np.ndarray, "n p w"]
+
+
+class Finer(NamedTuple):
+    """What a finer order of the solver says beyond a table of the usual order."""
+
+    names: tuple[str, ...]  # of the parameters (P)
+    rows: Float[np.ndarray, "n P"]
+    coarse: Float[np.ndarray, "n w"]  # reflectance as the table would have it
+    fine: Float[np.ndarray, "n w"]
+    slopes: Slopes  # of other specimens
+
+
+def solve_slopes(names: tuple[str, ...], form: str, rows: np.ndarray, bar: Any = None) -> Slopes:
+    """By adding-doubling, for the usual parameters; `bar` counts `STAGES`."""
+    by = tuple(name for name in names if PRIORS[name].usual)
+    found = []
+    for number, row in enumerate(rows):
+        specimen = Specimen(dict(zip(names, row.tolist(), strict=True)), form)
+        found.append(adding.slopes(specimen, WAVELENGTHS, by, order=FINE_ORDER, dtype=np.float32))
+        if bar is not None:
+            bar.update((number + 1) * STAGES // len(rows) - number * STAGES // len(rows))
+    reflectance, slopes = (np.asarray(part, float) for part in zip(*found, strict=True))
+    return Slopes(names, rows, reflectance, by, slopes)
+
+
+def solve_finer(table: Any, form: str, asked: np.ndarray, seed: int = 0, bar: Any = None) -> Finer:
+    """Reflectances of `fresh` specimens, half with the usual parameters free and half with every
+    one; and the slopes of some that are `asked`, with the usual ones free. `bar` counts `STAGES`.
+    """
+    box = names, _, _ = box_of(table)
+    key = jax.random.fold_in(jax.random.key(seed), 5)
+    rows = np.concatenate([fresh(*box, FINE // 2, key), fresh(*box, FINE // 2, key, names)])
+    lots = [rows[i : i + TOGETHER] for i in range(0, FINE, TOGETHER)]
+    coarse, fine = (
+        np.concatenate([solve_rows(names, lot, form, order) for lot in lots])
+        for order in (ADDING_ORDER, FINE_ORDER)
+    )
+    usual = 2 * (len(asked) // 10)  # where `specimens` has them
+    slopes = solve_slopes(names, form, asked[usual : usual + STEEP], bar)
+    return Finer(names, rows, coarse, fine, slopes)
+
+
+class Local(NamedTuple):
+    """The local regression of one form: parameters -> the logarithm of the light from inside, plus
+    `FLOOR`, as a share of what entered."""
+
+    form: str
+    network: Perceptron
+    centre: Float[np.ndarray, "f"]
+    scale: Float[np.ndarray, "f"]
+    middle: float
+    unit: float
+
+    def __call__(self, names: tuple[str, ...], rows: np.ndarray) -> Float[np.ndarray, "n w"]:
+        answer = jax.jit(self._function(names))
+        return np.concatenate([answer(lot) for lot in _lots(rows)])
+
+    def along(
+        self, names: tuple[str, ...], rows: np.ndarray, ways: np.ndarray
+    ) -> tuple[Float[np.ndarray, "n w"], Float[np.ndarray, "n w"]]:
+        """What it says of rows (n, P), and how that changes along a way at each (n, P)."""
+        return _changes(self._function(names), rows, ways)
+
+    def _function(self, names: tuple[str, ...]) -> Callable[[Array], Float[Array, "n w"]]:
+        of = _inputs(names, self.form)
+
+        def answer(rows: Array) -> Array:
+            x = (of(rows) - self.centre[None, None]) / self.scale[None, None]
+            return self.network.answer(x)[..., 0] * self.unit + self.middle
+
+        return answer
+
+
+def learn_locally(
+    table: Any,
+    form: str,
+    seed: int = 0,
+    bar: Any = None,
+    steps: int | None = None,
+    finer: Finer | None = None,
+) -> Local:
+    """The local regression of a table's rows (`read_table`) of one form, and of what is `finer`.
+
+    `bar` counts the stages; `steps` of the optimiser, `LOCAL_STEPS` if None.
     """
     mine = table["form"].values == forms_of(table).index(form)
     axes = tuple(str(name) for name in table["parameter"].values)
     rows = table["design"].values[mine]
-    at = surface_share(rows, axes)[:, None]
-    share = np.clip((table["reflectance"].values[mine] - at) / (1.0 - at), 0.0, None) + FLOOR
-    noise = (table["standard_error"].values[mine] / (1.0 - at) / share) ** 2
-    log = np.log(share)
+    share, log = _from_inside(axes, rows, table["reflectance"].values[mine])
+    noise = (table["standard_error"].values[mine] / share) ** 2
     x = np.concatenate([np.asarray(_inputs(axes, form)(lot)) for lot in _lots(rows)])
     x = x.reshape(-1, x.shape[-1])
-    centre, scale = x.mean(axis=0), x.std(axis=0) + 1e-6
+    centre, scale = x.mean(axis=0), x.std(axis=0) + np.float32(1e-6)
     middle, unit = float(log.mean()), float(log.std())
-    y = ((log - middle) / unit).astype(np.float32).reshape(-1, 1)
     weight, variance = None, float(noise.mean()) / unit**2
     if table.attrs["generator"] == "walker":  # the errors of `adding` are no noise
         weight = (1.0 / (noise + TRUST**2)).reshape(-1)
         variance = ALIKE / float(weight.mean()) / unit**2
         weight /= weight.mean()
-    x -= centre
-    x /= scale
-    steps = steps or LOCAL_STEPS
+    y, along = log.reshape(-1, 1), None
+    if finer is not None:
+        y = y + _order(finer, form, centre, scale, seed)((x - centre) / scale)
+        generator = np.random.default_rng([seed, 3])
+        lots = [_seen(finer.slopes, form, unit, generator) for _ in range(WAYS)]
+        inputs, logs, *changes = (np.concatenate(part) for part in zip(*lots, strict=True))
+        # what has no slopes is looked at along no way, where nothing changes
+        dx, dy = (np.pad(change, ((len(x), 0), (0, 0))) for change in changes)
+        along = dx / scale, dy / unit
+        x, y = np.concatenate([x, inputs]), np.concatenate([y, logs])
+    x, y = (x - centre) / scale, (y - middle) / unit
     network = Perceptron(
-        LOCAL_HIDDEN, steps, LOCAL_BATCH, variance=variance, seed=seed, bar=bar
-    ).fit(x, y, weight)
+        LOCAL_HIDDEN, steps or LOCAL_STEPS, LOCAL_BATCH, variance=variance, seed=seed, bar=bar
+    ).fit(x, y, weight, along)
+    return Local(form, network, centre, scale, middle, unit)
 
-    def answer(x: Array) -> np.ndarray:
-        found = network.predict((x.reshape(-1, x.shape[-1]) - centre[None]) / scale[None])
-        return found.reshape(x.shape[:-1]) * unit + middle
 
-    def every(names: tuple[str, ...], rows: np.ndarray) -> np.ndarray:
-        of = _inputs(names, form)
-        return np.concatenate([answer(of(lot)) for lot in _lots(rows)])
+def _from_inside(
+    names: tuple[str, ...], rows: np.ndarray, reflectance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Change of the reflectance for one of the logarithm that is learned, and that logarithm."""
+    entered = 1.0 - surface_share(rows, names)[:, None]
+    share = np.clip((reflectance - 1.0) / entered + 1.0, 0.0, None) + FLOOR
+    return entered * share, np.log(share)
 
-    return every
+
+def _order(
+    finer: Finer, form: str, centre: np.ndarray, scale: np.ndarray, seed: int
+) -> Callable[[np.ndarray], np.ndarray]:
+    """What the finer order adds to the logarithm (n, 1), from standardised inputs (n, f)."""
+    coarse, fine = (
+        _from_inside(finer.names, finer.rows, part)[1] for part in (finer.coarse, finer.fine)
+    )
+    x = np.concatenate([np.asarray(_inputs(finer.names, form)(lot)) for lot in _lots(finer.rows)])
+    unit = float((fine - coarse).std()) or 1.0
+    network = Perceptron((32, 32), ORDER_STEPS, LOCAL_BATCH, seed=seed)
+    network.fit(
+        (x.reshape(-1, x.shape[-1]) - centre) / scale, (fine - coarse).reshape(-1, 1) / unit
+    )
+    return lambda x: network.predict(x) * unit
+
+
+def _seen(
+    slopes: Slopes, form: str, size: float, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Inputs of the local regression (n w, f), the logarithm (n w, 1), and how both change along
+    some way at each specimen."""
+    names, rows = slopes.names, slopes.rows
+    share, log = _from_inside(names, rows, slopes.reflectance)
+    of_log = slopes.slopes / share[:, None]
+    place = [names.index(name) for name in slopes.by]
+    ways = np.zeros_like(rows)
+    # each parameter changes the logarithm as much
+    sizes = np.sqrt(len(place) * np.mean(of_log**2, axis=(0, 2)))
+    ways[:, place] = _ways(rows[:, place], size / sizes, generator)
+    inputs, change = _changes(_inputs(names, form), rows, ways)
+    steep = np.einsum("np,npw->nw", ways[:, place], of_log)
+    wide = (-1, inputs.shape[-1])
+    return inputs.reshape(wide), log.reshape(-1, 1), change.reshape(wide), steep.reshape(-1, 1)
+
+
+def _ways(rows: np.ndarray, lengths: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Directions (n, P) at rows (n, P): steps up or down of about these lengths (P), between
+    constant ones, as contents add up, and proportional ones, as their logarithms do. None where
+    there is nothing."""
+    there = np.abs(rows)
+    steps = lengths * np.sqrt(there / there.mean(axis=0))
+    return generator.choice([-1.0, 1.0], rows.shape) * steps
+
+
+def _changes(
+    function: Callable[[Array], Array], rows: np.ndarray, ways: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A function of rows (n, P), and how it changes along a way at each (n, P)."""
+    along = jax.jit(lambda rows, ways: jax.jvp(function, (rows,), (ways,)))
+    found = [along(*pair) for pair in zip(_lots(rows), _lots(ways), strict=True)]
+    value, change = (np.concatenate(part) for part in zip(*found, strict=True))
+    return value, change
 
 
 def _lots(rows: np.ndarray, size: int = 64) -> list[Array]:
@@ -349,28 +505,42 @@ def _fits(
     from tqdm import tqdm
 
     names, asked = box_of(table)[0], specimens(table, seed)
+    exact = table.attrs["generator"] == "adding"
     with (
         tqdm(
-            total=2 * len(forms) * STAGES, desc="train", unit="stage", disable=not progress
+            total=(2 + exact) * len(forms) * STAGES, desc="train", unit="stage",
+            disable=not progress,
         ) as bar,
         one_blas_thread(),
         ThreadPoolExecutor(THREADS) as pool,
-    ):
+    ):  # fmt: skip
 
         def one(form: str) -> dict[str, np.ndarray]:
-            log = learn_locally(table, form, seed, bar)(names, asked)
-            x = features(names, form, jnp.asarray(asked, jnp.float32))
-            network = Perceptron(HIDDEN, STEPS, BATCH, seed=seed, bar=bar)
-            return fit(np.asarray(x, float), log, network)
+            finer = solve_finer(table, form, asked, seed, bar) if exact else None
+            local = learn_locally(table, form, seed, bar, finer=finer)
+            x, log, along = answers(local, names, asked, seed)
+            return fit(x, log, Perceptron(HIDDEN, STEPS, BATCH, seed=seed, bar=bar), along)
 
         return dict(zip(forms, pool.map(one, forms), strict=True))
+
+
+def answers(
+    local: Local, names: tuple[str, ...], asked: np.ndarray, seed: int
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Features (n, f) of specimens (n, P), what the local regression says of them (n, w), and the
+    change of both along some way at each."""
+    spread = asked[len(asked) // 2 :].std(axis=0)  # of the prior
+    ways = _ways(asked, spread, np.random.default_rng([seed, 4]))
+    x, dx = _changes(partial(features, names, local.form), asked, ways)
+    log, change = local.along(names, asked, ways)
+    return x.astype(float), log, (dx, change)
 
 
 def specimens(table: Any, seed: int, count: int | None = None) -> np.ndarray:
     """(count, P), by default `SPECIMENS`, that the second regression learns from: a tenth spread
     over the box as the table is, as many over the model as published, where the usual parameters
-    alone move, and the rest from the prior: three tenths with the usual parameters free, half with
-    all."""
+    alone move, both `bared` as there, and the rest from the prior: three tenths with the usual
+    parameters free, half with all."""
     from scipy.stats import qmc
 
     names, lower, upper = box_of(table)
@@ -385,6 +555,7 @@ def specimens(table: Any, seed: int, count: int | None = None) -> np.ndarray:
     ]
     over = np.stack(columns, axis=1)
     over[part:, USUAL:] = Specimen().parameters(names)[USUAL:]
+    over = bared(over)
     prior = [
         state_vector(names, lower, upper, free).prior_draws(
             jax.random.fold_in(jax.random.key(seed), 2 + number), drawn
@@ -394,10 +565,16 @@ def specimens(table: Any, seed: int, count: int | None = None) -> np.ndarray:
     return np.concatenate([over, *prior])
 
 
-def fit(x: np.ndarray, log: np.ndarray, network: Any) -> dict[str, np.ndarray]:
+def fit(
+    x: np.ndarray,
+    log: np.ndarray,
+    network: Any,
+    along: tuple[np.ndarray, np.ndarray] | None = None,
+) -> dict[str, np.ndarray]:
     """Standardise, reduce, regress: features (n, f), and what they give (n, w).
 
-    The network is a `Perceptron`, or another with `coefs_` and `intercepts_`, not fitted yet.
+    The network is a `Perceptron`, or another with `coefs_` and `intercepts_`, not fitted yet;
+    `along`, which only the first takes, are the changes of both along one direction at each.
     Returns every number of what the surrogate evaluates, by name.
     """
     from sklearn.decomposition import PCA
@@ -409,7 +586,11 @@ def fit(x: np.ndarray, log: np.ndarray, network: Any) -> dict[str, np.ndarray]:
     pca: Any = PCA(min(COMPONENTS, len(x) // 4), random_state=0).fit(log)
     scores = pca.transform(log)
     unit = scores[:, 0].std()  # one scale for all, so that what matters more weighs more
-    network.fit(scaler.transform(x), scores / unit)
+    if along is None:
+        network.fit(scaler.transform(x), scores / unit)
+    else:
+        dx, dlog = along[0] / scaler.scale_, along[1] @ pca.components_.T / unit
+        network.fit(scaler.transform(x), scores / unit, along=(dx, dlog))
     weights, biases = (
         [*parts[:-1], parts[-1] * unit] for parts in (network.coefs_, network.intercepts_)
     )

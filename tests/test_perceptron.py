@@ -51,6 +51,31 @@ def test_examples_without_weight_do_not_count():
     assert rms(clone(network).fit(x, wrong).predict(x), y) > 1.0
 
 
+def test_slopes_are_learned_too_and_tell_more_than_values():
+    x, y = smooth(50)
+    dx = np.random.default_rng(3).normal(size=x.shape)
+    wave, tanh = np.cos(x[:, 0] + x[:, 1]), np.tanh(x[:, 0])
+    dy = np.stack(
+        [wave * (dx[:, 0] + dx[:, 1]), dx[:, 2] * tanh + x[:, 2] * dx[:, 0] * (1 - tanh**2)], axis=1
+    )
+    network = Perceptron((32, 32), steps=2000, batch=50, rate=0.01)
+    alone = clone(network).fit(x, y)
+    network.fit(x, y, along=(dx, dy))
+    fresh, expected = smooth(2000, seed=1)
+    off = [np.median(np.abs(one.predict(fresh) - expected)) for one in (network, alone)]
+    assert off[0] < 0.5 * off[1]
+    at, way = (jnp.asarray(part, jnp.float32) for part in (x, dx))
+    assert rms(np.asarray(jax.jvp(network.answer, (at,), (way,))[1]), dy) < 0.05 * rms(0.0, dy)
+
+
+def test_along_no_way_nothing_is_learned():
+    x, y = smooth(300)
+    network = Perceptron((8,), steps=100, batch=64)
+    before = clone(network).fit(x, y).predict(x)
+    still = network.fit(x, y, along=(0 * x, 0 * y)).predict(x)
+    np.testing.assert_allclose(still, before, atol=1e-4)
+
+
 def test_noise_makes_small_weights_more_probable():
     x, y = smooth(500)
     noisy = y + np.random.default_rng(1).normal(size=y.shape)

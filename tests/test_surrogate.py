@@ -457,6 +457,63 @@ def test_rows_are_learned_and_their_noise_is_smoothed(tmp_path, quick, noise, wi
     assert np.sqrt(np.mean((found - exact[form == 1]) ** 2)) < within
 
 
+def test_a_finer_order_and_slopes_are_learned_beyond_the_table(tmp_path, quick):
+    """The finer order has a hundredth more light; slopes of it are differences."""
+    more, by, step = 1.01, ("colloidal_melanin", "blood_reticular", "water"), 1e-3
+    filled(tmp_path / "table.zarr")
+    rows = table.read_table(tmp_path / "table.zarr")
+    box = names, _, _ = training.box_of(rows)
+    key = jax.random.key(3)
+    drawn, steep, fresh = (
+        training.fresh(*box, 64, jax.random.fold_in(key, i)).astype(np.float32) for i in range(3)
+    )
+
+    def slopes_at(p):
+        found = []
+        for name in by:
+            change = np.zeros_like(p)
+            change[:, names.index(name)] = step * p[:, names.index(name)]
+            up, down = (stand_in(names, "dispersed", p + sign * change) for sign in (1, -1))
+            found.append((up - down) / (2 * change.sum(axis=1))[:, None])
+        return more * np.stack(found, axis=1)
+
+    coarse = stand_in(names, "dispersed", drawn)
+    slopes = training.Slopes(
+        names, steep, more * stand_in(names, "dispersed", steep), by, slopes_at(steep)
+    )
+    finer = training.Finer(names, drawn, coarse, more * coarse, slopes)
+    true, surface = slopes_at(fresh), table.surface_share(fresh, names)[:, None]
+    off, shift = [], []
+    with one_blas_thread():
+        for beyond in (finer, None):
+            local = training.learn_locally(rows, "dispersed", finer=beyond)
+            change = []
+            for name in by:
+                ways = np.zeros_like(fresh)
+                ways[:, names.index(name)] = 1.0
+                log, along = local.along(names, fresh, ways)
+                change.append((1.0 - surface) * np.exp(log) * along)
+            square = np.mean((np.stack(change, axis=1) - true) ** 2, axis=(0, 2))
+            off.append(np.sqrt(square / np.mean(true**2, axis=(0, 2))))
+            found = surface + (1.0 - surface) * (np.exp(local(names, fresh)) - module.FLOOR)
+            shift.append(np.mean(found / stand_in(names, "dispersed", fresh)) - 1.0)
+    assert abs(shift[0] - 0.01) < 0.001
+    assert abs(shift[1]) < 0.005
+    assert np.all(off[0] < 0.5 * off[1])
+
+
+def test_ways_are_of_their_lengths_up_and_down_and_none_where_nothing_is():
+    rng = np.random.default_rng(0)
+    rows = rng.uniform(0.5, 2.0, (4000, 3)) * [1.0, 100.0, -0.01]
+    rows[::4, 1] = 0.0
+    lengths = np.array([2.0, 0.01, 50.0])
+    ways = training._ways(rows, lengths, rng)
+    assert np.all(ways[::4, 1] == 0.0)
+    np.testing.assert_allclose(np.sqrt(np.mean(ways**2, axis=0)), lengths, rtol=1e-6)
+    assert np.all(np.abs(np.mean(ways > 0, axis=0) - [0.5, 0.375, 0.5]) < 0.03)
+    assert np.all(np.abs(np.corrcoef(ways.T)[np.triu_indices(3, 1)]) < 0.06)
+
+
 def test_the_surface_is_that_of_the_corneum_at_each_wavelength(surrogate):
     member = surrogate.at("complex")
     p = dict(zip(member.names, Specimen().parameters(member.names), strict=True))
@@ -468,6 +525,16 @@ def test_the_surface_is_that_of_the_corneum_at_each_wavelength(surrogate):
         assert abs(found[i] - expected) < 1e-6
     camera = member.onto(np.eye(451)[:3].sum(axis=0)[None])
     assert abs(float(camera.surface_at(np.array(list(p.values())))[0]) - found[:3].mean()) < 1e-6
+
+
+@pytest.mark.parametrize("name", ["S1", "S2", "S3", "S4"])
+def test_the_papers_specimens_are_known_without_melanosomes_in_some_strata_too(surrogate, name):
+    specimen = Specimen.preset(name)
+    found = surrogate.of(specimen, table.WAVELENGTHS)
+    member = surrogate.at(specimen.melanosome_form)
+    rows = np.array([specimen.parameters(member.names)])
+    exact = training.solve(member.names, specimen.melanosome_form, rows)[0]
+    assert np.sqrt(np.mean((found - exact) ** 2)) < 5e-4
 
 
 def test_what_the_regression_sees_is_finite_at_the_edges_of_the_box(surrogate):

@@ -13,7 +13,7 @@ import pytest
 
 from hylios_fit import table
 from hylios_fit.errors import HyliosError
-from hylios_fit.skin import SPECS, Specimen
+from hylios_fit.skin import SPECS, STRATA, Specimen
 
 RAYS = 256
 ROWS = 24
@@ -61,7 +61,8 @@ def published(rows):
 # --- the design ----------------------------------------------------------------------------------
 
 
-def test_the_design_lies_in_its_ranges_and_fills_them():
+def test_the_design_lies_in_its_ranges_and_fills_them(monkeypatch):
+    monkeypatch.setattr(table, "bared", lambda values: values)  # see below
     parameters, form = table.design(1280)
     assert parameters.shape == (1280, len(table.NAMES))
     wide = parameters[~published(1280)]
@@ -94,6 +95,20 @@ def test_every_fifth_group_is_of_the_model_as_published():
     assert np.all(np.ptp(plain[:, : table.USUAL], axis=0) > 0)
 
 
+def test_in_every_third_group_strata_are_without_melanosomes_from_the_top_down():
+    groups = table.design(1440)[0].reshape(-1, 16, len(table.NAMES))
+    place = [table.NAMES.index(f"melanosome_{stratum}") for stratum in STRATA]
+    without = groups[..., place] == 0
+    np.testing.assert_array_equal(without, np.broadcast_to(without[:, :1], without.shape))
+    strata = without[:, 0].sum(axis=1)
+    assert np.all(strata[np.arange(90) % 3 < 2] == 0)
+    assert list(np.bincount(strata)) == [60, 10, 10, 10]
+    assert np.all(np.diff(without[:, 0].astype(int), axis=1) <= 0)
+    # of the published model and of the wide groups alike
+    for mine in (published(1440)[::16], ~published(1440)[::16]):
+        assert np.ptp(np.bincount(strata[mine])[1:]) == 0
+
+
 def test_the_indices_of_a_row_are_moved_together_as_dispersion_moves_them():
     from hylios_fit import skin, training
 
@@ -124,9 +139,10 @@ def test_rows_of_a_group_agree_in_what_they_must_and_differ_in_the_rest(generato
     groups = parameters.reshape(-1, table.SHARE, len(table.NAMES))
     together = table.PATHS if generator == "walker" else table.INDICES
     assert np.all(groups[..., together] == groups[:, :1, together])
-    for axis in range(len(table.NAMES)):
-        values = 32 // table.SHARE if together[axis] else 32  # each for both forms
-        assert len(np.unique(parameters[:, axis])) == values
+    for axis, column in enumerate(parameters.T):
+        there = column[column != 0]  # without what is bared
+        values = len(there) // 2  # each for both forms
+        assert len(np.unique(there)) == (values // table.SHARE if together[axis] else values)
 
 
 def test_another_seed_is_another_design():
