@@ -13,7 +13,7 @@ for parameters that act through the layers alone whether or not the table has an
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
 from pathlib import Path
@@ -327,30 +327,35 @@ def solve_slopes(names: tuple[str, ...], form: str, rows: np.ndarray, bar: Any =
     """By adding-doubling, for the usual parameters; `bar` counts `STAGES`."""
     by = tuple(name for name in names if PRIORS[name].usual)
     found = []
-    for number, row in enumerate(rows):
+    for row in _in_stages(rows, bar):
         specimen = Specimen(dict(zip(names, row.tolist(), strict=True)), form)
         found.append(adding.slopes(specimen, WAVELENGTHS, by, order=FINE_ORDER, dtype=np.float32))
-        if bar is not None:
-            bar.update((number + 1) * STAGES // len(rows) - number * STAGES // len(rows))
     reflectance, slopes = (np.asarray(part, float) for part in zip(*found, strict=True))
     return Slopes(names, rows, reflectance, by, slopes)
 
 
 def solve_finer(table: Any, form: str, asked: np.ndarray, seed: int = 0, bar: Any = None) -> Finer:
     """Reflectances of `fresh` specimens, half with the usual parameters free and half with every
-    one; and the slopes of some that are `asked`, with the usual ones free. `bar` counts `STAGES`.
+    one; and the slopes of some that are `asked`, with the usual ones free. `bar` counts `STAGES`
+    of each.
     """
     box = names, _, _ = box_of(table)
     key = jax.random.fold_in(jax.random.key(seed), 5)
     rows = np.concatenate([fresh(*box, FINE // 2, key), fresh(*box, FINE // 2, key, names)])
     lots = [rows[i : i + TOGETHER] for i in range(0, FINE, TOGETHER)]
-    coarse, fine = (
-        np.concatenate([solve_rows(names, lot, form, order) for lot in lots])
-        for order in (ADDING_ORDER, FINE_ORDER)
-    )
+    orders = ADDING_ORDER, FINE_ORDER
+    found = [[solve_rows(names, lot, form, n) for n in orders] for lot in _in_stages(lots, bar)]
+    coarse, fine = (np.concatenate(part) for part in zip(*found, strict=True))
     usual = 2 * (len(asked) // 10)  # where `specimens` has them
     slopes = solve_slopes(names, form, asked[usual : usual + STEEP], bar)
     return Finer(names, rows, coarse, fine, slopes)
+
+
+def _in_stages(items: Any, bar: Any) -> Iterator[Any]:
+    for number, item in enumerate(items):
+        yield item
+        if bar is not None:
+            bar.update((number + 1) * STAGES // len(items) - number * STAGES // len(items))
 
 
 class Local(NamedTuple):
@@ -440,6 +445,7 @@ def _order(
     finer: Finer, form: str, centre: np.ndarray, scale: np.ndarray, seed: int
 ) -> Callable[[np.ndarray], np.ndarray]:
     """What the finer order adds to the logarithm (n, 1), from standardised inputs (n, f)."""
+    # what dispersion does to the surface is left out of both, and cancels
     coarse, fine = (
         _from_inside(finer.names, finer.rows, part)[1] for part in (finer.coarse, finer.fine)
     )
@@ -508,7 +514,7 @@ def _fits(
     exact = table.attrs["generator"] == "adding"
     with (
         tqdm(
-            total=(2 + exact) * len(forms) * STAGES, desc="train", unit="stage",
+            total=(2 + 2 * exact) * len(forms) * STAGES, desc="train", unit="stage",
             disable=not progress,
         ) as bar,
         one_blas_thread(),
