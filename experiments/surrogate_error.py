@@ -92,9 +92,10 @@ def _slopes(surrogate: Surrogate, form: str, count: int, seed: int, folder: Path
     member = surrogate.at(form)
     vector = state_vector(member.names, member.lower, member.upper)
     rows = vector.prior_draws(jax.random.fold_in(jax.random.key(seed), 200), count)
-    solve = partial(training.solve_slopes, member.names, form, rows)
     kept = folder / f"slopes_{form}_{count}.npz"
-    exact = _shared.kept_arrays(kept, lambda: solve()._asdict())
+    exact = _shared.kept_arrays(
+        kept, lambda: training.solve_slopes(member.names, form, rows)._asdict()
+    )
     names, true = [str(name) for name in exact["by"]], exact["slopes"]
     own = jax.jit(jax.vmap(jax.jacfwd(member._evaluate)))(rows.astype(np.float32))
     place = [member.names.index(name) for name in names]

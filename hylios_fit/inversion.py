@@ -520,13 +520,12 @@ def _inverted(job: _Job, wavelength_nm: np.ndarray, measured: np.ndarray, name: 
     inflation, model_error = 1.0, 0.0
     if significant:
         shape = _model_error(wavelength_nm[job.usable], level[job.usable])
-        smooth, model_error = _with_model_error(again, stated, shape, found, target)
+        found, model_error = _with_model_error(again, stated, shape, found, target)
         if not job.noise_follows_reflectance:  # somebody stated it
             noisier = again({form: covariance * reduced for form, covariance in stated.items()})
             unlikely = 0.5 * (0.5 * np.log(reduced) / np.log(NOISE_WITHIN)) ** 2
-            if _evidence(noisier).max() - unlikely > _evidence(smooth).max():
-                smooth, model_error, inflation = noisier, 0.0, float(np.sqrt(reduced))
-        found = smooth
+            if _evidence(noisier).max() - unlikely > _evidence(found).max():
+                found, model_error, inflation = noisier, 0.0, float(np.sqrt(reduced))
     evidence = _evidence(found)
     weights = np.exp(evidence - evidence.max())
     return _fit_from(

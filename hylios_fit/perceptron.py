@@ -90,13 +90,15 @@ class Perceptron(RegressorMixin, BaseEstimator):
 
     def predict(self, x: Any) -> np.ndarray:
         """Targets (n, k) at inputs (n, f)."""
-        return np.asarray(jax.jit(self.answer)(jnp.asarray(x, jnp.float32)))
+        return np.asarray(_answer(self._matrices(), jnp.asarray(x, jnp.float32)))
 
     def answer(self, x: Float[Array, "... f"]) -> Float[Array, "... k"]:
         """As `predict`, in JAX."""
+        return _forward(self._matrices(), x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], -1)
+
+    def _matrices(self) -> list[Array]:
         pairs = zip(self.coefs_, self.intercepts_, strict=True)
-        matrices = [jnp.concatenate([w, b[None]]) for w, b in pairs]
-        return _forward(matrices, x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], -1)
+        return [jnp.concatenate([w, b[None]]) for w, b in pairs]
 
 
 class _Data(NamedTuple):
@@ -134,6 +136,7 @@ def _forward(matrices: list[Array], x: Float[Array, "n f"]) -> Float[Array, "n k
     return x
 
 
+_answer = jax.jit(_forward)
 _times = partial(jnp.matmul, precision="highest")
 
 

@@ -303,6 +303,12 @@ def _inputs(names: tuple[str, ...], form: str) -> Callable[[Array], Float[Array,
     return jax.jit(lambda rows: jax.vmap(local_features)(of(rows)))
 
 
+def _examples(names: tuple[str, ...], form: str, rows: np.ndarray) -> np.ndarray:
+    """The inputs at every wavelength of rows (n, P), (n w, f)."""
+    x = np.concatenate([np.asarray(_inputs(names, form)(lot)) for lot in _lots(rows)])
+    return x.reshape(-1, x.shape[-1])
+
+
 class Slopes(NamedTuple):
     """Specimens, and how their reflectance changes with some of the parameters."""
 
@@ -406,8 +412,7 @@ def learn_locally(
     rows = table["design"].values[mine]
     share, log = _from_inside(axes, rows, table["reflectance"].values[mine])
     noise = (table["standard_error"].values[mine] / share) ** 2
-    x = np.concatenate([np.asarray(_inputs(axes, form)(lot)) for lot in _lots(rows)])
-    x = x.reshape(-1, x.shape[-1])
+    x = _examples(axes, form, rows)
     centre, scale = x.mean(axis=0), x.std(axis=0) + np.float32(1e-6)
     middle, unit = float(log.mean()), float(log.std())
     weight, variance = None, float(noise.mean()) / unit**2
@@ -415,17 +420,17 @@ def learn_locally(
         weight = (1.0 / (noise + TRUST**2)).reshape(-1)
         variance = ALIKE / float(weight.mean()) / unit**2
         weight /= weight.mean()
-    y, along = log.reshape(-1, 1), None
+    x, y, along = (x - centre) / scale, log.reshape(-1, 1), None
     if finer is not None:
-        y = y + _order(finer, form, centre, scale, seed)((x - centre) / scale)
+        y = y + _order(finer, form, centre, scale, seed)(x)
         generator = np.random.default_rng([seed, 3])
         lots = [_seen(finer.slopes, form, unit, generator) for _ in range(WAYS)]
         inputs, logs, *changes = (np.concatenate(part) for part in zip(*lots, strict=True))
         # what has no slopes is looked at along no way, where nothing changes
         dx, dy = (np.pad(change, ((len(x), 0), (0, 0))) for change in changes)
         along = dx / scale, dy / unit
-        x, y = np.concatenate([x, inputs]), np.concatenate([y, logs])
-    x, y = (x - centre) / scale, (y - middle) / unit
+        x, y = np.concatenate([x, (inputs - centre) / scale]), np.concatenate([y, logs])
+    y = (y - middle) / unit
     network = Perceptron(
         LOCAL_HIDDEN, steps or LOCAL_STEPS, LOCAL_BATCH, variance=variance, seed=seed, bar=bar
     ).fit(x, y, weight, along)
@@ -449,12 +454,10 @@ def _order(
     coarse, fine = (
         _from_inside(finer.names, finer.rows, part)[1] for part in (finer.coarse, finer.fine)
     )
-    x = np.concatenate([np.asarray(_inputs(finer.names, form)(lot)) for lot in _lots(finer.rows)])
-    unit = float((fine - coarse).std()) or 1.0
-    network = Perceptron((32, 32), ORDER_STEPS, LOCAL_BATCH, seed=seed)
-    network.fit(
-        (x.reshape(-1, x.shape[-1]) - centre) / scale, (fine - coarse).reshape(-1, 1) / unit
-    )
+    x = (_examples(finer.names, form, finer.rows) - centre) / scale
+    more = (fine - coarse).reshape(-1, 1)
+    unit = float(more.std()) or 1.0
+    network = Perceptron((32, 32), ORDER_STEPS, LOCAL_BATCH, seed=seed).fit(x, more / unit)
     return lambda x: network.predict(x) * unit
 
 
