@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import time
@@ -16,11 +17,12 @@ from experiments import _shared
 from hylios_fit import skin, tally, walker
 from hylios_fit.simulation import simulate
 from hylios_fit.skin import Specimen
+from hylios_fit.threads import cores
 
 TOLERANCE = 0.0016  # what 10^5 rays at each wavelength give where half of them come back
 SPECIMENS = ("S1", "S2", "S3", "S4")
 GOAL_S = {"S3": 1.0, "S4": 5.0}
-REPEATS = 3
+REPEATS = 5
 PIGMENTS = (
     "melanosome_granulosum", "melanosome_spinosum", "melanosome_basale", "colloidal_melanin",
     "eumelanin", "pheomelanin", "blood_papillary", "blood_reticular", "oxygen_saturation",
@@ -37,39 +39,72 @@ def run(
     repeats: int = REPEATS,
     memory_rays: tuple[int, ...] = MEMORY_RAYS,
 ) -> dict[str, Any]:
-    """Processor time of whole curves and of their parts, medians of warm runs."""
+    """Processor time of whole curves and of their parts on one core, and the time that curves take
+    on all; medians of warm runs."""
     nm = np.arange(250.0, 2500.1, 5.0) if wavelengths is None else np.asarray(wavelengths, float)
-    found = {}
+    settings = {"seed": seed, "tolerance": tolerance, "repeats": repeats}
+    found = _alone(wavelengths=nm.tolist(), specimens=specimens, **settings)
     for name in specimens:
-        specimen = Specimen.preset(name)
-        keys = iter(jax.random.split(jax.random.key(seed), 4 * repeats + 4))
-
-        def curve(specimen=specimen, keys=keys):
-            return simulate(specimen, nm, tolerance=tolerance, key=next(keys))
-
-        first, _ = _cost(curve)
-        lots = [_cost(curve) for _ in range(repeats)]
-        costs = np.array([lot[0] for lot in lots])
-        last = lots[-1][1]
-        found[name] = {
-            "core_seconds": _shared.significant(np.median(costs[:, 0]), 3),
-            "core_seconds_all": _shared.significant(costs[:, 0], 3),
-            "wall_seconds": _shared.significant(np.median(costs[:, 1]), 3),
-            "first_call_core_seconds": _shared.significant(first[0], 3),
-            "rays": int(np.median([lot[1].rays for lot in lots])),
-            "largest_standard_error": _shared.significant(last.standard_error.max()),
-            "standard_error": _shared.significant(last.standard_error, 3),
-            **_parts(specimen, nm, jax.random.key(seed), repeats),
-        }
+        lots = [cost for cost, _ in _curves(name, nm, **settings)]
+        found[name]["wall_seconds"] = _shared.significant(np.median([t for _, t in lots]), 3)
     return {
         "wavelength_nm": nm.tolist(),
         "tolerance": tolerance,
         "goal_core_seconds": {k: v for k, v in GOAL_S.items() if k in found},
         "repeats": repeats,
+        "cores": cores(),
         "pigments": list(PIGMENTS),
         "specimens": found,
         "peak_memory_mib": {str(rays): _peak_memory(rays, len(nm)) for rays in memory_rays},
     }
+
+
+def _alone(**settings: Any) -> dict[str, Any]:
+    """`on_one_core` by a process that has one core from its start: threads that wait for each other
+    keep a second one busy, which says nothing of the work."""
+    code = """
+import json, os, sys
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+from experiments import walker_speed
+print(json.dumps(walker_speed.on_one_core(**json.load(sys.stdin))))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], input=json.dumps(settings), stdout=subprocess.PIPE,
+        text=True, check=True, cwd=_shared.REPOSITORY,
+    )  # fmt: skip
+    return json.loads(done.stdout)
+
+
+def on_one_core(
+    seed: int, wavelengths: list[float], specimens: tuple[str, ...], tolerance: float, repeats: int
+) -> dict[str, Any]:
+    """By specimen, on the cores that the process has."""
+    nm = np.asarray(wavelengths)
+    found = {}
+    for name in specimens:
+        first, *lots = _curves(name, nm, seed, tolerance, repeats)
+        costs = np.array([cost for cost, _ in lots])
+        last = lots[-1][1]
+        found[name] = {
+            "core_seconds": _shared.significant(np.median(costs[:, 0]), 3),
+            "core_seconds_all": _shared.significant(costs[:, 0], 3),
+            "first_call_core_seconds": _shared.significant(first[0][0], 3),
+            "rays": int(np.median([curve.rays for _, curve in lots])),
+            "largest_standard_error": _shared.significant(last.standard_error.max()),
+            "standard_error": _shared.significant(last.standard_error, 3),
+            **_parts(Specimen.preset(name), nm, jax.random.key(seed), repeats),
+        }
+    return found
+
+
+def _curves(
+    name: str, nm: np.ndarray, seed: int, tolerance: float, repeats: int
+) -> list[tuple[tuple[float, float], Any]]:
+    """Cost and curve of the first call and of some more."""
+    keys = jax.random.split(jax.random.key(seed), repeats + 1)
+    specimen = Specimen.preset(name)
+    return [_cost(lambda k=key: simulate(specimen, nm, tolerance=tolerance, key=k)) for key in keys]
 
 
 def _cost(call: Callable[[], Any]) -> tuple[tuple[float, float], Any]:
@@ -137,6 +172,7 @@ def _peak_memory(rays: int, wavelengths: int) -> float:
 import resource, jax, numpy as np
 from hylios_fit.simulation import simulate
 from hylios_fit.skin import Specimen
+from hylios_fit.threads import cores
 nm = np.linspace(250, 2500, {wavelengths})
 simulate(Specimen.preset("S3"), nm, rays={rays}, key=jax.random.key(0))
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)

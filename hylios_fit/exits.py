@@ -19,6 +19,7 @@ from hylios_fit import fresnel, tally, walker
 from hylios_fit.errors import HyliosError
 from hylios_fit.simulation import ABSORB, check_request, progress_bar
 from hylios_fit.skin import Specimen
+from hylios_fit.threads import side_by_side
 
 if TYPE_CHECKING:
     import xarray
@@ -263,18 +264,20 @@ def _walk(
     plan, own_only = walker.plan_or_own(medium, ABSORB)
     angle = math.radians(incidence)
     batch = min(walker.BATCH, rays)
+
+    def lot(first: int) -> tuple[np.ndarray, ...]:
+        paths, exits = walker.walk_out(
+            plan.layers, specimen.melanosome_form, key, incidence=angle, first=first, rays=batch,
+            independent=independent, shares=plan.shares,
+        )  # fmt: skip
+        into = jnp.asarray(bins(exits), jnp.int32)
+        sums = tally.collect_bins(paths, into, columns, plan, medium, own_only)
+        return tuple(np.asarray(part, float) for part in sums)
+
     total, sent = None, 0
     with progress_bar(rays, progress) as bar:
-        while sent < rays:
-            paths, exits = walker.walk_out(
-                plan.layers, specimen.melanosome_form, key, incidence=angle, first=sent, rays=batch,
-                independent=independent, shares=plan.shares,
-            )  # fmt: skip
-            lot = tally.collect_bins(
-                paths, jnp.asarray(bins(exits), jnp.int32), columns, plan, medium, own_only
-            )
-            lot = tuple(np.asarray(part, float) for part in lot)
-            total = lot if total is None else tuple(a + b for a, b in zip(total, lot, strict=True))
+        for found in side_by_side(lot, range(0, rays, batch)):
+            total = found if total is None else tuple(map(np.add, total, found))
             sent += batch
             bar.update(batch)
     assert total is not None

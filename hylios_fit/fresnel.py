@@ -10,7 +10,6 @@ import math
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -90,6 +89,14 @@ def basis(u: tuple[Array, Array, Array]) -> tuple[tuple[Array, ...], tuple[Array
     return (1.0 + sign * ux * ux * a, sign * b, -sign * ux), (b, sign + uy * uy * a, -uy)
 
 
+def unit(u: Any) -> tuple[Array, Array, Array]:
+    """A direction without the rounding of its length, which would add up: one step of Newton's
+    from a length near 1."""
+    x, y, z = u
+    norm = 1.5 - 0.5 * (x * x + y * y + z * z)
+    return x * norm, y * norm, z * norm
+
+
 def interact(
     u: tuple[Array, Array, Array],
     facet: tuple[Array, Array, Array],
@@ -111,9 +118,7 @@ def interact(
     ratio = n1 / n2
     along_u = jnp.where(transmitted, ratio, 1.0)
     along_n = jnp.where(transmitted, ratio * c - cos_t, 2.0 * c)
-    out = tuple(along_u * ui + along_n * ni for ui, ni in zip(u, facet, strict=True))
-    norm = jax.lax.rsqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)  # rounding would add up otherwise
-    out = (out[0] * norm, out[1] * norm, out[2] * norm)
+    out = unit(tuple(along_u * ui + along_n * ni for ui, ni in zip(u, facet, strict=True)))
     # the mean normal points to the side of the incoming ray: -sign(uz)
     side = jnp.where(transmitted, 1.0, -1.0) * jnp.sign(u[2])
     valid = (cos_i > 0) & (out[2] * side > 0)

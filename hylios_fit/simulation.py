@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import partial
 from typing import Any
 
 import jax
@@ -12,9 +13,11 @@ import numpy as np
 from hylios_fit import adding, analog, fresnel, skin, tally, walker
 from hylios_fit.errors import HyliosError
 from hylios_fit.skin import Specimen
+from hylios_fit.threads import side_by_side
 from hylios_fit.units import WAVELENGTH_MAX, WAVELENGTH_MIN
 
 METHODS = ("walker", "analog", "adding", "surrogate")
+FIRST = 2  # batches before a tolerance is asked for
 MOST_RAYS = 20_000_000  # where a tolerance stops asking for more
 ANALOG_BATCH = 4096
 ABSORB = 0.5  # see `walker.walk`: the answer does not depend on it, the cost does
@@ -92,16 +95,15 @@ def with_covariance(
     layers = specimen.layers(nm)
     angle = math.radians(incidence)
     batch = min(walker.BATCH, rays)
-    lots = [
-        tally.moments(
-            walker.walk(
-                layers, specimen.melanosome_form, key,
-                incidence=angle, first=first, rays=batch, absorb=ABSORB,
-            ),
-            layers, ABSORB,
-        )
-        for first in range(0, rays, batch)
-    ]  # fmt: skip
+
+    def lot(first: int) -> tuple[np.ndarray, np.ndarray]:
+        paths = walker.walk(
+            layers, specimen.melanosome_form, key,
+            incidence=angle, first=first, rays=batch, absorb=ABSORB,
+        )  # fmt: skip
+        return tally.moments(paths, layers, ABSORB)
+
+    lots = list(side_by_side(lot, range(0, rays, batch)))
     mean = np.mean([lot[0] for lot in lots], axis=0)
     covariance = np.mean([lot[1] for lot in lots], axis=0) / len(lots)
     surface = fresnel.surface_reflectance(angle, 1.0, specimen.index_corneum, specimen.roughness)
@@ -134,31 +136,35 @@ def _walked(
 ) -> Curve:
     plan, own_only = walker.plan_or_own(medium, ABSORB)
     batch = min(walker.BATCH, rays) if tolerance is None else walker.BATCH
-    total = None
-    sent = 0
-    error = np.full(nm.shape, np.inf)
-    paths = None
+    walk = partial(
+        walker.walk, form=specimen.melanosome_form, incidence=angle, rays=batch,
+        independent=independent,
+    )  # fmt: skip
+    if batch == walker.BATCH and not own_only:
+        other = jax.random.fold_in(key, 1)
+        pilot = walk(plan.layers, key=other, shares=plan.shares, sent=tally.PILOT)
+        plan = tally.improve(pilot, plan, medium)
+
+    def lot(first: int) -> tally.Tally:
+        paths = walk(plan.layers, key=key, first=first, shares=plan.shares)
+        return tally.collect(paths, plan.layers, medium, own_only=own_only, shares=plan.shares)
+
+    total, sent, more = None, 0, math.ceil(rays / batch) if tolerance is None else FIRST
     with progress_bar(rays if tolerance is None else None, progress) as bar:
-        while sent < rays if tolerance is None else np.max(error) > tolerance and sent < MOST_RAYS:
-            if paths is not None and sent == batch and not own_only:
-                plan = tally.improve(paths, plan, medium)
-            paths = walker.walk(
-                plan.layers,
-                specimen.melanosome_form,
-                key,
-                incidence=angle,
-                first=sent,
-                rays=batch,
-                independent=independent,
-                shares=plan.shares,
-            )
-            total = tally.add(
-                total,
-                tally.collect(paths, plan.layers, medium, own_only=own_only, shares=plan.shares),
-            )
-            sent += batch
+        while more:
+            if tolerance is not None:
+                more = min(more, math.ceil((MOST_RAYS - sent) / batch))
+            for found in side_by_side(lot, range(sent, sent + more * batch, batch)):
+                total = tally.add(total, found)
+                bar.update(batch)
+            sent += more * batch
+            assert total is not None
             error = (1.0 - surface) * np.asarray(total.standard_error, float)
-            bar.update(batch)
+            more = 0
+            if tolerance is not None and np.max(error) > tolerance and sent < MOST_RAYS:
+                # most of what is missing, as the error itself is an estimate
+                missing = (np.max(error) / tolerance) ** 2 - 1.0
+                more = max(math.floor(0.9 * missing * sent / batch), 1)
     assert total is not None
     inside = (1.0 - surface) * np.asarray(total.mean, float)
     return Curve(

@@ -15,26 +15,36 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hylios_fit.skin import Layers
-from hylios_fit.walker import HITS, SUMS, Paths, Plan, hero_shares, log_density, node_shares
+from hylios_fit.walker import (
+    NEVER,
+    NODES,
+    SUMS,
+    Paths,
+    Plan,
+    angle_density,
+    hero_shares,
+    log_density,
+    node_shares,
+)
 
 CHUNK = 512  # rays at a time, so that memory does not depend on their number
-MOST_STRATA = 128  # columns whose means are told apart: beyond, the errors are a little too large
-NEVER = -1e30
+GROUP = 64  # rays whose sum counts as one for the errors: columns take turns within it
+GROUPS = 256  # no fewer, or what they say of the errors is noise
 
 
 class Tally(NamedTuple):
     """Sums over rays that entered the skin; w wavelengths.
 
-    `common` is the part of `weight2` that is no error: every column that was walked sends its own
-    share of the rays, so that only the scatter about the mean of each column's rays counts.
-    `freedom` is the number of rays less that of those means.
+    `squares` has the squared sum of the weights of each group of rays, over their number: columns
+    take turns among the rays, so that only the scatter between groups is error. `groups` is their
+    number.
     """
 
     rays: Float[Array, ""]
-    freedom: Float[Array, ""]
+    groups: Float[Array, ""]
     weight: Float[Array, "w"]
     weight2: Float[Array, "w"]
-    common: Float[Array, "w"]
+    squares: Float[Array, "w"]
 
     @property
     def mean(self) -> Float[Array, "w"]:
@@ -44,8 +54,8 @@ class Tally(NamedTuple):
     @property
     def standard_error(self) -> Float[Array, "w"]:
         """Standard error of `mean`."""
-        spread = jnp.maximum(self.weight2 - self.common, 0.0)
-        return jnp.sqrt(spread / (self.rays * jnp.maximum(self.freedom, 1.0)))
+        spread = jnp.maximum(self.squares - self.weight**2 / self.rays, 0.0)
+        return jnp.sqrt(spread / (self.rays * jnp.maximum(self.groups - 1.0, 1.0)))
 
     @property
     def effective_rays(self) -> Float[Array, "w"]:
@@ -54,34 +64,34 @@ class Tally(NamedTuple):
 
 
 class _Weigher(NamedTuple):
-    """What turns the sums along a path into its logarithmic weight; k columns were walked."""
+    """What turns the sums along a path into its weight; k columns were walked."""
 
-    walked: Array  # (16 + nodes, k)
-    asked: Array  # (16 + nodes, w)
+    walked: Array  # (18, k), of the logarithm of the density
+    asked: Array  # (18, w)
     log_share: Array  # (k,)
+    nodes: Array | None  # (node, w): what each counts, where `asked` leaves the angles out
 
 
-def _weigher(walked: Layers, asked: Layers, absorb: Any, shares: Array | None) -> _Weigher:
+def _weigher(
+    walked: Layers, asked: Layers, absorb: Any, shares: Array | None, own_only: bool = False
+) -> _Weigher:
     from_walk, asked_for = log_density(walked, absorb), log_density(asked)
     # a common reference keeps the exponents small, so that float32 is enough
     reference = jnp.mean(from_walk, axis=1, keepdims=True)
+    from_walk, asked_for = from_walk - reference, asked_for - reference
+    nodes = None
+    if not own_only:  # or the angles are the same, and cancel
+        from_walk = from_walk + angle_density(walked.theta_0)
+        if shares is None:
+            asked_for = asked_for + angle_density(asked.theta_0)
+        else:
+            nodes = node_shares(asked.theta_0)
     shares = hero_shares(walked.theta_0) if shares is None else shares
-    return _Weigher(
-        jnp.concatenate([from_walk - reference, _log(node_shares(walked.theta_0))]),
-        jnp.concatenate([asked_for - reference, _log(node_shares(asked.theta_0))]),
-        _log(shares),
-    )
+    return _Weigher(from_walk, asked_for, _log(shares), nodes)
 
 
 def _log(share: Array) -> Array:
     return jnp.where(share > 0, jnp.log(jnp.where(share > 0, share, 1.0)), NEVER)
-
-
-def _columns(paths: Paths, nodes: int) -> Array:
-    """(ray, 16 + nodes): sums, and the node where it matters, that is if a melanosome was hit."""
-    hit = jnp.sum(paths.sums[:, HITS], axis=1) > 0
-    node = jnp.where(hit, paths.node, -1)
-    return jnp.concatenate([paths.sums, _of(node, nodes, paths.sums.dtype)], axis=1)
 
 
 def _of(kind: Array, kinds: int, dtype: Any) -> Array:
@@ -92,27 +102,32 @@ def _of(kind: Array, kinds: int, dtype: Any) -> Array:
 _product = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
 
 
-def _log_walked(weigher: _Weigher, columns: Array) -> Array:
-    """(ray,): logarithm of the density of each path in the walk."""
-    each = _product(columns, weigher.walked) + weigher.log_share[None]
-    return jax.nn.logsumexp(each, axis=1)
-
-
 def _weights(weigher: _Weigher, paths: Paths) -> Array:
     """(ray, w)"""
-    columns = _columns(paths, weigher.walked.shape[0] - SUMS)
+    each = _product(paths.sums, weigher.walked) + weigher.log_share[None]
+    return _wanted(weigher, paths, jax.nn.logsumexp(each, axis=1))
+
+
+def _wanted(weigher: _Weigher, paths: Paths, unit: Array) -> Array:
+    """(ray, w): density of each path that came back, where exp(`unit`) is 1."""
+    if weigher.nodes is not None:
+        nodes = jnp.asarray(NODES, unit.dtype)
+        angles = _product(paths.sums, angle_density(nodes))
+        largest = jnp.max(angles, axis=1)
+        angles = jnp.exp(angles - largest[:, None])
+        unit = unit - largest
     # inside the exponential, so that gradients of rays that ended within stay finite
-    walked = jnp.where(paths.escaped > 0, _log_walked(weigher, columns), -NEVER)
+    unit = jnp.where(paths.escaped > 0, unit, -NEVER)
     one = jnp.ones((1, weigher.asked.shape[1]), weigher.asked.dtype)
-    columns = jnp.concatenate([columns, -walked[:, None]], axis=1)
-    return jnp.exp(_product(columns, jnp.concatenate([weigher.asked, one])))
+    columns = jnp.concatenate([paths.sums, -unit[:, None]], axis=1)
+    density = jnp.exp(_product(columns, jnp.concatenate([weigher.asked, one])))
+    return density if weigher.nodes is None else density * _product(angles, weigher.nodes)
 
 
 def _own_weights(weigher: _Weigher, paths: Paths) -> Array:
     """(ray,): the weight for the column that each ray walked for, shared with no other."""
-    columns = _columns(paths, weigher.walked.shape[0] - SUMS)
     ratio = (weigher.asked - weigher.walked).T[paths.hero]
-    exponent = jnp.sum(columns * ratio, axis=1) - weigher.log_share[paths.hero]
+    exponent = jnp.sum(paths.sums * ratio, axis=1) - weigher.log_share[paths.hero]
     return jnp.where(paths.escaped > 0, jnp.exp(jnp.where(paths.escaped > 0, exponent, 0.0)), 0.0)
 
 
@@ -129,10 +144,10 @@ def _sum_own_weights(weigher: _Weigher, paths: Paths, columns: int) -> tuple[Arr
     return total[:, 0], total[:, 1]
 
 
-def _chunks(paths: Paths) -> Paths:
-    """The rays by `CHUNK`; what fills the last one never came out."""
+def _chunks(paths: Paths, group: int = 1) -> Paths:
+    """The rays by `CHUNK`, whole groups; what fills the last one never came out."""
     rays = paths.hero.shape[0]
-    size = min(CHUNK, rays)
+    size = min(CHUNK, rays + -rays % group)
     padding = -rays % size
     return Paths(
         *(
@@ -144,42 +159,48 @@ def _chunks(paths: Paths) -> Paths:
     )
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(3,))
-def _sum_weights(weigher: _Weigher, paths: Paths, stratum: Array, strata: int):
-    """(stratum, w) sums of the weights of its rays, and (w,) sums of their squares."""
-    return _moments(weigher, paths, stratum, strata)[:2]
+def _group(rays: int) -> int:
+    return max(1, min(GROUP, rays // GROUPS))
 
 
-def _moments(weigher: _Weigher, paths: Paths, stratum: Array, strata: int, sums: bool = False):
-    width = weigher.asked.shape[1]
+@jax.custom_jvp
+def _sum_weights(weigher: _Weigher, paths: Paths) -> tuple[Array, Array, Array]:
+    """(w,) sums of the weights, of their squares, and of the squares of groups over their rays."""
+    return _moments(weigher, paths)[:3]
+
+
+def _moments(weigher: _Weigher, paths: Paths, sums: bool = False):
+    width, dtype = weigher.asked.shape[1], weigher.asked.dtype
+    group = _group(paths.hero.shape[0])
+    chunks = _chunks(paths, group)
+    number, size = chunks.hero.shape
+    first = jnp.arange(number * size // group).reshape(number, -1) * group
+    # groups beyond the last ray are empty
+    each = jnp.clip(paths.hero.shape[0] - first, 1, group).astype(dtype)
 
     def part(carry, chunk):
-        each, of = chunk
-        weight = _weights(weigher, each)
-        columns = _of(of, strata, weight.dtype)
+        lot, rays = chunk
+        weight = _weights(weigher, lot)
+        grouped = jnp.sum(weight.reshape(-1, group, width), axis=1)
+        w, w2, squares, by_sum = carry
         if sums:
-            columns = jnp.concatenate([columns, _columns(each, len(weigher.walked) - SUMS)], axis=1)
-        w, w2 = carry
-        return (w + _product(columns.T, weight), w2 + jnp.sum(weight**2, axis=0)), None
+            by_sum = by_sum + _product(lot.sums.T, weight)
+        w, w2 = w + jnp.sum(grouped, axis=0), w2 + jnp.sum(weight**2, axis=0)
+        return (w, w2, squares + jnp.sum(grouped**2 / rays[:, None], axis=0), by_sum), None
 
-    rows = strata + (len(weigher.walked) if sums else 0)
-    zero = jnp.zeros((rows, width), weigher.asked.dtype)
-    chunks = _chunks(paths)
-    padded = jnp.pad(stratum, (0, chunks.hero.size - stratum.size)).reshape(chunks.hero.shape)
-    (w, w2), _ = jax.lax.scan(part, (zero, zero[0]), (chunks, padded))
-    return w[:strata], w2, w[strata:]
+    zero = jnp.zeros((SUMS if sums else 0, width), dtype)
+    none = jnp.zeros(width, dtype)
+    return jax.lax.scan(part, (none, none, none, zero), (chunks, each))[0]
 
 
 @_sum_weights.defjvp
-def _(strata, primals, tangents):
+def _(primals, tangents):
     # The derivative of a weight is the weight times the sums along its path: their means serve
     # every parameter at once.
-    weigher, paths, stratum = primals
-    by_stratum, weight2, mean_sums = _moments(weigher, paths, stratum, strata, sums=True)
-    change = tangents[0].asked
-    first = jnp.arange(strata)[:, None] == 0
-    slope = jnp.where(first, jnp.sum(mean_sums * change, axis=0)[None], 0.0)
-    return (by_stratum, weight2), (slope.astype(by_stratum.dtype), jnp.zeros_like(weight2))
+    weight, weight2, squares, mean_sums = _moments(*primals, sums=True)
+    slope = jnp.sum(mean_sums * tangents[0].asked, axis=0)
+    none = jnp.zeros_like(weight2)
+    return (weight, weight2, squares), (slope.astype(weight.dtype), none, none)
 
 
 @partial(jax.jit, static_argnames=("own_only",))
@@ -193,32 +214,32 @@ def collect(
 ) -> Tally:
     """Sum the weights of `paths`, walked in the layers `walked`, for the layers `asked`.
 
-    `walked`, `absorb` and `shares` (by default `walker.hero_shares`) must be what `walker.walk` was
-    given. `weight`, and so `mean`, is differentiable in the coefficients of `asked`; the errors are
-    not. `own_only` shares no path among columns, as it must be where the refractive index depends
-    on the wavelength: `asked` then has the columns of `walked`.
+    `walked`, `absorb` and `shares` must be what `walker.walk` was given: shares of a `plan`, or
+    none where every wavelength has a column of its own (`walker.hero_shares`). `weight`, and so
+    `mean`, is differentiable in the coefficients of `asked`; the errors are not. `own_only` shares
+    no path among columns, as it must be where the refractive index depends on the wavelength:
+    `asked` then has the columns of `walked`.
     """
-    weigher = _weigher(walked, asked, absorb, shares)
+    weigher = _weigher(walked, asked, absorb, shares, own_only)
     rays, columns = paths.hero.shape[0], walked.mu_a.shape[1]
     total = jnp.asarray(float(rays), weigher.asked.dtype)
+    if not own_only:
+        groups = -(-rays // _group(rays))
+        found = _sum_weights(weigher, paths)
+        return Tally(total, jnp.asarray(float(groups), total.dtype), *found)
+    # each column has its share of the rays: only the scatter about its own mean is error
     count = jnp.bincount(paths.hero, length=columns).astype(total.dtype)
-    if own_only:
-        weight, weight2 = _sum_own_weights(weigher, paths, columns)
-        common = jax.lax.stop_gradient(weight) ** 2 / jnp.maximum(count, 1.0)
-    else:
-        # means of too few rays each would say nothing
-        strata = columns if rays >= 8 * columns and columns <= MOST_STRATA else 1
-        stratum = paths.hero if strata > 1 else jnp.zeros_like(paths.hero)
-        count = count if strata > 1 else total[None]
-        by_stratum, weight2 = _sum_weights(weigher, paths, stratum, strata)
-        weight = jnp.sum(by_stratum, axis=0)
-        still = jax.lax.stop_gradient(by_stratum)
-        common = jnp.sum(still**2 / jnp.maximum(count, 1.0)[:, None], axis=0)
+    weight, weight2 = _sum_own_weights(weigher, paths, columns)
+    still = jax.lax.stop_gradient(weight) ** 2
+    squares = weight2 + still / total - still / jnp.maximum(count, 1.0)
     means = jnp.sum((count > 0).astype(total.dtype))
-    return Tally(total, total - means, weight, weight2, common)
+    return Tally(total, total - means + 1.0, weight, weight2, squares)
 
 
-def improve(paths: Paths, plan: Plan, asked: Layers, rays: int = 2048) -> Plan:
+PILOT = 2048  # rays that `improve` looks at
+
+
+def improve(paths: Paths, plan: Plan, asked: Layers, rays: int = PILOT) -> Plan:
     """The plan with shares that make the largest error among the wavelengths smaller.
 
     From a pilot, the `paths` of that plan, of which it looks at the first `rays`.
@@ -237,12 +258,10 @@ def improve(paths: Paths, plan: Plan, asked: Layers, rays: int = 2048) -> Plan:
 @jax.jit
 def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> Array:
     weigher = _weigher(walked, asked, 1.0, shares)
-    columns = _columns(paths, len(weigher.walked) - SUMS)
-    each = _product(columns, weigher.walked)
-    largest = jnp.max(each, axis=1, keepdims=True)
-    density = jnp.exp(each - largest)
-    out = paths.escaped[:, None] > 0
-    wanted = jnp.exp(jnp.where(out, _product(columns, weigher.asked) - largest, NEVER))
+    each = _product(paths.sums, weigher.walked)
+    largest = jnp.max(each, axis=1)
+    density = jnp.exp(each - largest[:, None])
+    wanted = _wanted(weigher, paths, largest)
     sent = _of(paths.hero, len(shares), density.dtype)
     mean_of = sent / jnp.maximum(jnp.sum(sent, axis=0, keepdims=True), 1.0)
 
@@ -256,7 +275,7 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> Arra
         largest = jnp.max(error)
         best = jnp.where(largest < least, now, best)
         # the largest errors lead: the gradient of a high power mean, in damped steps
-        lead = (error / largest) ** 5
+        lead = (error / largest) ** 8
         borne = _product((ray * _product(scatter, lead) / mixed), density)
         new = now * (borne / jnp.sum(borne * now)) ** 0.2
         # never nothing: what the pilot missed would weigh without a bound
@@ -275,7 +294,7 @@ def collect_bins(
 
     `place` (ray,) is the bin of each ray, -1 for none. Their sum over all bins is `collect`'s.
     """
-    weigher = _weigher(plan.layers, asked, 1.0, plan.shares)
+    weigher = _weigher(plan.layers, asked, 1.0, plan.shares, own_only)
 
     def part(carry, chunk):
         each, at = chunk

@@ -1,14 +1,45 @@
-"""Linear algebra held to one thread.
+"""Threads where they help, and none where they do not.
 
-On the small matrices of this package threads gain nothing, and where cores are few or shared they
-wait for each other: a solve of 33 by 33 then takes a hundred times as long as it should.
+Linear algebra is held to one thread: on the small matrices of this package threads gain nothing,
+and where cores are few or shared they wait for each other: a solve of 33 by 33 then takes a hundred
+times as long as it should. A program of many small steps, such as a walk, XLA cannot spread over
+cores (it keeps two busy for the work of one): several run side by side instead.
 """
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+
+
+def cores() -> int:
+    """How many this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def side_by_side(function: Callable[[Item], Answer], items: Iterable[Item]) -> Iterator[Answer]:
+    """The function of each item, in their order, as many at once as there are cores; in the
+    precision and on the device that the caller set."""
+    import jax
+
+    config: Any = jax.config
+    wide, device = config.jax_enable_x64, config.jax_default_device
+
+    def one(item: Item) -> Answer:
+        with jax.enable_x64(wide), jax.default_device(device):
+            return jax.block_until_ready(function(item))
+
+    with ThreadPoolExecutor(cores()) as pool:
+        yield from pool.map(one, items)
 
 
 def one_blas_thread() -> AbstractContextManager[Any]:

@@ -66,10 +66,13 @@ FINE = 256  # specimens of each form that are solved at both orders
 ORDER_STEPS = 4000
 STEEP = 256  # specimens of each form whose slopes are solved
 WAYS = 4  # in which each of them is looked at
+LEAST = {True: 0.025, False: 0.003}
+"""By how much a step along a usual parameter, or another, changes the logarithm at least."""
+LOOKED_AT = 384  # specimens that say how much it does
 SPECIMENS = 131_072  # of each form, that the local regression answers for
 COMPONENTS = 80
 HIDDEN = (192, 128, 128)
-STEPS = 80_000
+STEPS = 120_000
 BATCH = 1024
 LEAST_ROWS = 64  # of each form
 CHECK_ORDER = 8  # of the solver that they are held against
@@ -385,6 +388,12 @@ class Local(NamedTuple):
         """What it says of rows (n, P), and how that changes along a way at each (n, P)."""
         return _changes(self._function(names), rows, ways)
 
+    def slopes(self, names: tuple[str, ...], rows: np.ndarray) -> Float[np.ndarray, "n w P"]:
+        """How what it says of rows (n, P) changes with every parameter."""
+        function = self._function(names)
+        every = jax.jit(jax.vmap(jax.jacfwd(lambda row: function(row[None])[0])))
+        return np.concatenate([every(lot) for lot in _lots(rows, 16)])
+
     def _function(self, names: tuple[str, ...]) -> Callable[[Array], Float[Array, "n w"]]:
         of = _inputs(names, self.form)
 
@@ -538,11 +547,22 @@ def answers(
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """Features (n, f) of specimens (n, P), what the local regression says of them (n, w), and the
     change of both along some way at each."""
-    spread = asked[len(asked) // 2 :].std(axis=0)  # of the prior
-    ways = _ways(asked, spread, np.random.default_rng([seed, 4]))
+    ways = _ways(asked, _lengths(local, names, asked, seed), np.random.default_rng([seed, 4]))
     x, dx = _changes(partial(features, names, local.form), asked, ways)
     log, change = local.along(names, asked, ways)
     return x.astype(float), log, (dx, change)
+
+
+def _lengths(local: Local, names: tuple[str, ...], asked: np.ndarray, seed: int) -> np.ndarray:
+    """Of the steps (P) along each parameter: its spread in the prior, or more where that changes
+    too little for its slope to be learned (`LEAST`)."""
+    own = asked[len(asked) // 2 :].std(axis=0)
+    prior = np.arange(2 * (len(asked) // 10), len(asked))  # where `specimens` has them
+    some = np.random.default_rng(seed + 1).choice(prior, min(LOOKED_AT, len(prior)), replace=False)
+    size = np.sqrt(np.abs(asked[some]) / np.abs(asked).mean(axis=0)) * own
+    changes = np.sqrt(np.mean((local.slopes(names, asked[some]) * size[:, None]) ** 2, (0, 1)))
+    least = np.array([LEAST[PRIORS[name].usual] for name in names])
+    return own * np.maximum(least / np.maximum(changes, 1e-9), 1.0)
 
 
 def specimens(table: Any, seed: int, count: int | None = None) -> np.ndarray:

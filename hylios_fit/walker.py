@@ -12,11 +12,11 @@ spectrum with few rays. The weights are bounded, and `tally` does the sums.
 Two things differ from the letter of the paper (`analog`):
 - The inside of a melanosome is averaged: a hit costs its mean survival, tabulated from the literal
   trace, whatever the particle's orientation was.
-- Where theta_0 falls from 5 degrees to 0 (780 to 1300 nm), a ray walks with one of the two angles
-  of `NODES` around it, drawn so that the mean of theta_0^2, which is what diffusion knows, is
-  right: paths that bend differently could not serve each other otherwise. Between two nodes this
-  changes the reflectance a little, by at most 0.002 in skin full of melanosomes (`adding` with
-  the two angles and with the one between them).
+- Where theta_0 falls from 5 degrees to 0 (780 to 1300 nm), rays of a `plan` walk with the angles
+  of `NODES`, and a wavelength has one of the two around its own, so that the mean of theta_0^2,
+  which is what diffusion knows, is right: long paths that bend a little differently could not
+  serve each other otherwise. Between two nodes this changes the reflectance a little, by at most
+  0.002 in skin full of melanosomes (`adding` with the two angles and with the one between them).
 """
 
 from __future__ import annotations
@@ -39,14 +39,16 @@ LENGTH = slice(0, 6)  # path length in each layer, cm
 HITS = slice(6, 9)  # melanosomes or complexes hit in each stratum
 PROPOSED = slice(9, 12)  # the same before rejections
 FIBRE, FIBRE_LENGTH, TISSUE, BOTTOM = range(12, 16)
-SUMS = 16
+BENT, STRAIGHT = 16, 17  # sum of the angles of the hits; 1 if there were hits and none bent
+SUMS = 18
 
 NODES = scattering.LATIMER_ANGLE * np.sqrt(
     [0.0, 0.008, 0.03, 0.075, 0.14, 0.235, 0.36, 0.53, 0.74, 1.0]
 )
+APART = 0.25  # of the gaps between their squares: no further error where that is largest
 ROUND = 8  # steps between two exchanges of rays that ended
 LANES = 1024
-BATCH = 65_536  # rays of one compiled call; memory does not depend on the number of rays
+BATCH = 32_768  # rays of one compiled call; memory does not depend on the number of rays
 
 
 class Paths(NamedTuple):
@@ -54,13 +56,12 @@ class Paths(NamedTuple):
 
     sums: what adds up along each path (`LENGTH`, `HITS`, ...); zero weight where `escaped` is 0.
     escaped: 1 out above, -1 out below the last layer walked, 0 ended inside.
-    hero: column of the layers that each ray walked for; node: of its angle in `NODES`.
+    hero: column of the layers that each ray walked for.
     """
 
-    sums: Float[Array, "ray 16"]
+    sums: Float[Array, "ray 18"]
     escaped: Float[Array, "ray"]
     hero: Int[Array, "ray"]
-    node: Int[Array, "ray"]
 
 
 class Exits(NamedTuple):
@@ -80,9 +81,7 @@ class _Medium(NamedTuple):
     event: Array  # (7 k,): rate of particles, fibres or tissue
     absorb: Array  # (7 k,)
     albedo: Array  # (7 k,)
-    node: Array  # (k,): the lower of the two nodes, and the share of the upper one
-    node_part: Array
-    nodes: Array  # the angles
+    theta_0: Array  # (k,)
     particle: Array  # (3,): size of the particle relative to that in the basale
     axes: Array  # (2,): a, b in the basale (a sphere's radius twice)
     facets: Array
@@ -151,13 +150,12 @@ class _Lane(NamedTuple):
     place: tuple[Array, ...]  # x, y, where exits are recorded
     lengths: tuple[Array, ...]  # in each of the seven layers
     counts: tuple[Array, ...]  # hits and proposed in each stratum, fibres, tissue, bottom
+    bent: Array  # sum of the angles of the hits
 
 
 def _medium(layers: Layers, form: str, absorb: float) -> _Medium:
     dtype = layers.mu_a.dtype
     k = layers.mu_a.shape[1]
-    shares = node_shares(layers.theta_0)
-    low = jnp.argmax(shares > 0, axis=0)
     one = jnp.ones((1, k), dtype)
     event = layers.mu_particle + layers.mu_tissue
     event = event.at[4].set(layers.mu_fibre)
@@ -175,9 +173,7 @@ def _medium(layers: Layers, form: str, absorb: float) -> _Medium:
         event=seven(event, 0.0 * one),
         absorb=seven(absorb * layers.mu_a, absorb * layers.mu_a[4:5]),
         albedo=seven(layers.hit_albedo**absorb, one),
-        node=low,
-        node_part=1.0 - jnp.take_along_axis(shares, low[None], axis=0)[0],
-        nodes=jnp.asarray(NODES, dtype),
+        theta_0=layers.theta_0,
         particle=jnp.asarray([melanosome.SHRINKING[s] for s in STRATA], dtype),
         axes=jnp.asarray(axes, dtype),
         facets=jnp.asarray(_facets(float(layers.roughness)), dtype),
@@ -342,8 +338,7 @@ def _step(
     c, s = _keep(m, *_circle(u6))
     cos, b, c = _keep(m, cos, sin * c, sin * s)
     u = _keep(m, *_combine(cos, lane.u, b, p, c, q))
-    (norm,) = _keep(m, jax.lax.rsqrt(u[0] ** 2 + u[1] ** 2 + u[2] ** 2))
-    u = (u[0] * norm, u[1] * norm, u[2] * norm)
+    u = fresnel.unit(u)
 
     # the interface
     here = crosses | (lane.phase == WAITING)
@@ -402,6 +397,7 @@ def _step(
         counts=tuple(
             total + _number(flag, dtype) for flag, total in zip(happened, lane.counts, strict=True)
         ),
+        bent=lane.bent + jnp.where(bends & accepted, theta, 0.0),
     )
 
 
@@ -428,15 +424,19 @@ def _start(
         place=(zero,) * (2 if exits else 0),
         lengths=(zero,) * 7,
         counts=(zero,) * 9,
+        bent=zero,
     )
 
 
 def _sums(lane: _Lane) -> Array:
-    """(lane, 16): what adds up along each path."""
+    """(lane, 18): what adds up along each path."""
     first, last = lane.lengths[:4], lane.lengths[5]
     unspent, spent = lane.lengths[4], lane.lengths[6]
     hits, (fibre, tissue, bottom) = lane.counts[:6], lane.counts[6:]
-    rows = (*first, unspent + spent, last, *hits, fibre, unspent, tissue, bottom)
+    straight = _number((sum(hits[:3]) > 0) & (lane.bent == 0), lane.bent.dtype)
+    rows = (
+        *first, unspent + spent, last, *hits, fibre, unspent, tissue, bottom, lane.bent, straight,
+    )  # fmt: skip
     return jnp.stack(rows, axis=1)
 
 
@@ -450,6 +450,7 @@ def _walk(
     heroes: Array,
     key: Array,
     first: Array,
+    sent: Array,
     incidence: Array,
     rays: int,
     independent: bool,
@@ -460,10 +461,6 @@ def _walk(
     round_length: int,
 ) -> tuple[Paths, Array]:
     dtype = medium.thickness.dtype
-    number = first + jnp.arange(rays, dtype=jnp.uint32)
-    lot = _uniform(number, jnp.zeros((), jnp.uint32), 4, key, dtype)[0]
-    upper = (lot < medium.node_part[heroes]).astype(medium.node.dtype)
-    nodes = medium.node[heroes] + upper
     fresh = partial(
         _start, incidence=incidence, dtype=dtype,
         independent=independent, spheroid=spheroid, exits=exits,
@@ -472,7 +469,8 @@ def _walk(
     def round_(state):
         step, lane, place, sums, escaped, left, upcoming = state
         ray = jnp.clip(place, 0, rays - 1)
-        hero, theta_0 = heroes[ray], medium.nodes[nodes[ray]]
+        hero = heroes[ray]
+        theta_0 = medium.theta_0[hero]
 
         def one(_, carry):
             step, lane = carry
@@ -480,7 +478,7 @@ def _walk(
             return step, _step(lane, medium, hero, theta_0, step, key, spheroid, below)
 
         step, lane = jax.lax.fori_loop(0, round_length, one, (step, lane))
-        ended = (lane.phase >= ENDED) & (place < rays)
+        ended = (lane.phase >= ENDED) & (place < sent)
         # out-of-range places are dropped: each ray is written once, when it ends
         target = jnp.where(ended, place, rays)
         sums = sums.at[target].set(_sums(lane), mode="drop")
@@ -491,7 +489,7 @@ def _walk(
             left = left.at[target].set(way, mode="drop")
         order = upcoming + jnp.cumsum(ended, dtype=jnp.int32) - 1
         place = jnp.where(ended, order, place).astype(jnp.int32)
-        begins = ended & (place < rays)
+        begins = ended & (place < sent)
         new = fresh(first + place.astype(jnp.uint32))
         lane = jax.tree.map(lambda n, o: jnp.where(begins, n, o), new, lane)
         return step, lane, place, sums, escaped, left, upcoming + jnp.sum(ended, dtype=jnp.int32)
@@ -508,9 +506,9 @@ def _walk(
         jnp.asarray(lanes, jnp.int32),
     )
     state = jax.lax.while_loop(
-        lambda s: jnp.any((s[1].phase < ENDED) & (s[2] < rays)), round_, state
+        lambda s: jnp.any((s[1].phase < ENDED) & (s[2] < sent)), round_, state
     )
-    return Paths(state[3], state[4], heroes, nodes.astype(jnp.int32)), state[5]
+    return Paths(state[3], state[4], heroes), state[5]
 
 
 def walk(
@@ -525,6 +523,7 @@ def walk(
     independent: bool = False,
     heroes: np.ndarray | None = None,
     shares: Float[Array, "k"] | None = None,
+    sent: int | None = None,
 ) -> Paths:
     """Walk `rays` rays, number `first` and on, spread over the layers' columns.
 
@@ -532,11 +531,12 @@ def walk(
     the answer does not depend on it). `independent` leaves out the rejection of particles that
     overlap the one before or cross a boundary. `incidence` in radians. The same key and numbers
     (`first`, `rays`) give the same paths. `shares` of the rays for each column, by default
-    `hero_shares`; or `heroes`, the column of each.
+    `hero_shares`; or `heroes`, the column of each. Only the first `sent` of them set out, if given:
+    a pilot needs no program of its own.
     """
     return _run(
         layers, form, key, incidence, first, rays, absorb, independent, heroes, shares, False,
-        LAYERS[-1],
+        LAYERS[-1], sent,
     )[0]  # fmt: skip
 
 
@@ -566,8 +566,9 @@ def walk_out(
 
 
 def _run(
-    layers, form, key, incidence, first, rays, absorb, independent, heroes, shares, exits, last
-) -> tuple[Paths, Array]:
+    layers, form, key, incidence, first, rays, absorb, independent, heroes, shares, exits, last,
+    sent=None,
+) -> tuple[Paths, Array]:  # fmt: skip
     medium = _medium(layers, form, absorb)
     bits = jax.random.bits(key, (2,), jnp.uint32)
     if heroes is None:
@@ -578,6 +579,7 @@ def _run(
         jnp.asarray(heroes, jnp.int32),
         bits,
         jnp.asarray(first, jnp.uint32),
+        jnp.asarray(rays if sent is None else sent, jnp.int32),
         jnp.asarray(incidence, layers.mu_a.dtype),
         rays,
         independent,
@@ -590,13 +592,24 @@ def _run(
 
 
 def node_shares(theta_0: Float[Array, "w"]) -> Float[Array, "node w"]:
-    """Probability of each of `NODES` at each wavelength; their mean of theta^2 is theta_0^2."""
+    """Probability of each of `NODES` at each wavelength; their mean of theta^2 is theta_0^2.
+
+    Those of the two nodes around a square a little smaller and one a little larger, half each, so
+    that no wavelength depends on the rays of one node.
+    """
     nodes = jnp.asarray(NODES**2, theta_0.dtype)[:, None]
     gaps = nodes[1:] - nodes[:-1]
     square = theta_0[None] ** 2
-    up = jnp.clip((square - nodes[:-1]) / gaps, 0.0, 1.0)  # (node - 1, w)
-    edge = jnp.ones_like(square)
-    return jnp.concatenate([edge, up]) - jnp.concatenate([up, 0.0 * edge])
+
+    def around(square: Array) -> Array:
+        up = jnp.clip((square - nodes[:-1]) / gaps, 0.0, 1.0)  # (node - 1, w)
+        edge = jnp.ones_like(square)
+        return jnp.concatenate([edge, up]) - jnp.concatenate([up, 0.0 * edge])
+
+    apart = APART * 0.5 * (gaps[1:] + gaps[:-1])
+    away = jnp.sum(jnp.pad(apart, ((1, 1), (0, 0))) * around(square), axis=0, keepdims=True)
+    away = jnp.minimum(away, jnp.minimum(square, jnp.maximum(nodes[-1:] - square, 0.0)))
+    return 0.5 * (around(square - away) + around(square + away))
 
 
 def hero_shares(theta_0: Float[Array, "w"]) -> Float[Array, "w"]:
@@ -629,9 +642,9 @@ class Plan(NamedTuple):
 
 COLUMNS = (4, 1, 1, 1, 2, 2, 2, 2, 2, 8)  # of each node of `NODES`
 LEAST_SHARE = 0.01  # of the rays, for every column that serves anything
-BETWEEN = 0.2  # for `absorb` where theta_0 falls: little is absorbed there, and rays are few
 FEW = 0.004  # hits in a straight pass of a stratum without melanosomes
 NOTHING = 1e-12
+NEVER = -1e30
 REACH = 0.6  # how far, in the logarithm of a scattering coefficient, paths serve others well
 
 
@@ -677,9 +690,8 @@ def plan(layers: Layers, absorb: float = 0.4) -> Plan:
             # as far as the columns on both sides, which these paths help out
             near = mine[ends[max(i - 1, 0)] : ends[min(i + 2, count)] + 1]
             chosen.append(mine[at[i]])
-            part = absorb if node in (0, len(COLUMNS) - 1) else BETWEEN
-            mu_a.append(part * wide.mu_a[:, near].min(axis=1))
-            albedo.append(wide.hit_albedo[:, near].max(axis=1) ** part)
+            mu_a.append(absorb * wide.mu_a[:, near].min(axis=1))
+            albedo.append(wide.hit_albedo[:, near].max(axis=1) ** absorb)
         shares += [total[-1] / count] * count
     at = np.array(chosen)
     # where there are no melanosomes a few are met, or no path would know what the first one does
@@ -721,11 +733,11 @@ def plan_or_own(layers: Layers, absorb: float) -> tuple[Plan, bool]:
     return plan(layers), False
 
 
-def log_density(layers: Layers, absorb: float = 1.0) -> Float[Array, "16 w"]:
+def log_density(layers: Layers, absorb: float = 1.0) -> Float[Array, "18 w"]:
     """Coefficients of the sums along a path in the logarithm of its density at each wavelength.
 
     What does not depend on the wavelength or the contents (directions, facets, positions of
-    particles) is left out: only ratios of densities count. The chance of a node is `node_shares`.
+    particles) is left out: only ratios of densities count. Angles of hits have `angle_density`.
     """
 
     def log(x):  # the derivative of x^n at 0 stays what it is: 1 for a single hit
@@ -744,8 +756,25 @@ def log_density(layers: Layers, absorb: float = 1.0) -> Float[Array, "16 w"]:
             -layers.mu_fibre[None],
             log(layers.mu_tissue[5:]),
             (absorb * log(layers.bottom)) * row,
+            0.0 * row,
+            0.0 * row,
         ]
     )
+
+
+def angle_density(theta_0: Float[Array, "w"]) -> Float[Array, "18 w"]:
+    """As `log_density`, of the angles by which hits bend the path (`exponential_density`); relative
+    to the last of `NODES`."""
+    some = theta_0 > 0
+    angle: Any = jnp.where(some, theta_0, NODES[-1])
+    norm = scattering.exponential_log_norm(angle) - scattering.exponential_log_norm(NODES[-1])
+    # a hit never bends where theta_0 is 0, and always does elsewhere
+    bent: Any = jnp.where(some, 1.0 / NODES[-1] - 1.0 / angle, NEVER)
+    straight: Any = jnp.where(some, NEVER, 0.0)
+    rows: list[Array] = [jnp.zeros_like(theta_0)] * SUMS
+    rows[HITS] = [-norm] * 3
+    rows[BENT], rows[STRAIGHT] = bent, straight
+    return jnp.stack(rows).astype(theta_0.dtype)
 
 
 assert len(LAYERS) == 6

@@ -3,6 +3,11 @@
 import subprocess
 import sys
 
+import jax
+import jax.numpy as jnp
+
+from hylios_fit.threads import cores, side_by_side
+
 SCRIPT = """
 from hylios_fit.threads import one_blas_thread
 from threadpoolctl import threadpool_info
@@ -23,3 +28,12 @@ def test_every_blas_is_held_whatever_was_loaded_before():
         [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False, timeout=120
     )
     assert run.returncode == 0, run.stderr
+
+
+def test_items_keep_their_order_and_the_callers_precision():
+    assert cores() >= 1
+    for wide, dtype in ((False, jnp.float32), (True, jnp.float64)):
+        with jax.enable_x64(wide):
+            found = list(side_by_side(lambda i: jnp.arange(3.0) + i, range(5)))
+        assert [float(x[0]) for x in found] == [0.0, 1.0, 2.0, 3.0, 4.0]
+        assert {x.dtype for x in found} == {jnp.dtype(dtype)}

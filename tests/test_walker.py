@@ -266,7 +266,7 @@ def test_other_company_leaves_a_wavelength_the_same(found):
     two = tally.collect(walk(layers, jax.random.key(6)), layers, layers)
     common = np.array([0, 2])
     part = [
-        tally.Tally(t.rays, t.freedom, t.weight[common], t.weight2[common], t.common[common])
+        tally.Tally(t.rays, t.groups, t.weight[common], t.weight2[common], t.squares[common])
         for t in (found, two)
     ]
     within(*part)
@@ -279,14 +279,19 @@ def test_where_the_angle_falls_shared_paths_agree_with_own(layers):
         tally.collect(paths, falling, falling),
         tally.collect(paths, falling, falling, own_only=True),
     )
-    nodes = np.asarray(paths.node)
-    theta2 = walker.NODES**2
+    hero, sums = np.asarray(paths.hero), np.asarray(paths.sums, float)
     for i, theta_0 in enumerate(np.asarray(falling.theta_0, float)):
-        mine = nodes[np.asarray(paths.hero) == i]
-        mean = theta2[mine].mean()
-        spread = theta2[mine].std() / math.sqrt(mine.size)
-        assert abs(mean - theta_0**2) < 4 * spread + 1e-6 * theta2[-1]
-        assert set(mine) <= set(range(len(walker.NODES)))
+        mine = sums[(hero == i) & (np.asarray(paths.escaped) > 0)]
+        hits, bent = mine[:, walker.HITS].sum(axis=1), mine[:, walker.BENT]
+        np.testing.assert_array_equal(mine[:, walker.STRAIGHT], (hits > 0) & (bent == 0))
+        assert np.all(bent[hits == 0] == 0)
+        if theta_0 == 0:
+            assert np.all(bent == 0)
+        else:
+            # nearly a gamma law of shape 2, which refuses 0.8 % of the angles at 5 degrees
+            mean = bent.sum() / hits.sum()
+            error = theta_0 * math.sqrt(2.0 / hits.sum())
+            assert abs(mean / (2.0 * theta_0) - 1.0) < 0.02 + 4 * error / theta_0
 
 
 def test_node_shares_keep_the_mean_square_of_the_angle(dtype):
@@ -297,6 +302,31 @@ def test_node_shares_keep_the_mean_square_of_the_angle(dtype):
     np.testing.assert_allclose(
         walker.NODES**2 @ shares, np.asarray(theta_0) ** 2, atol=1e-6 * walker.NODES[-1] ** 2 + 1e-9
     )
+
+
+def test_no_wavelength_depends_on_the_rays_of_one_node():
+    theta_0 = jnp.asarray(scattering.melanosome_angle(np.linspace(790.0, 1250.0, 93)), jnp.float32)
+    shares = np.asarray(walker.node_shares(theta_0), float)
+    assert shares.max() < 0.93
+    assert np.all((shares > 0).sum(axis=0) <= 4)
+    ends = walker.node_shares(jnp.asarray([0.0, scattering.LATIMER_ANGLE], jnp.float32))
+    np.testing.assert_allclose(ends[np.array([0, -1])], np.eye(2), atol=1e-6)
+
+
+def test_what_nodes_change_is_small():
+    from hylios_fit import adding
+
+    between = np.sqrt(0.5 * (walker.NODES[1:] ** 2 + walker.NODES[:-1] ** 2))
+    theta_0 = np.sort(np.concatenate([walker.NODES, between]))
+    at = np.searchsorted(theta_0, walker.NODES)
+    for name, nm in (("S1", 1250.0), ("S4", 800.0)):
+        medium = Specimen.preset(name).layers(np.full(theta_0.size, nm))
+        exact = np.asarray(
+            adding.skin(medium._replace(theta_0=jnp.asarray(theta_0, jnp.float32))).reflectance
+        )
+        mixed = exact[at] @ np.asarray(walker.node_shares(jnp.asarray(theta_0)), float)
+        assert np.abs(mixed - exact).max() < 0.0025
+        assert np.ptp(exact) > 10 * np.abs(mixed - exact).max()
 
 
 def test_heroes_are_spread_as_stated():
@@ -356,7 +386,6 @@ def test_weights_in_single_precision_are_those_in_double(paths, layers, found):
             jnp.asarray(np.asarray(paths.sums), jnp.float64),
             jnp.asarray(np.asarray(paths.escaped), jnp.float64),
             jnp.asarray(np.asarray(paths.hero)),
-            jnp.asarray(np.asarray(paths.node)),
         )
         layers = S3.layers(NM, jnp.float64)
         double = tally.collect(wide, layers, layers)
@@ -414,7 +443,10 @@ def test_covariance_of_a_plan_has_the_mean_and_the_errors_of_its_tally(spectrum)
     mean, covariance = tally.moments(paths, plan.layers, 1.0, spectrum, plan.shares)
     found = tally.collect(paths, plan.layers, spectrum, shares=plan.shares)
     np.testing.assert_allclose(mean, found.mean, rtol=1e-4)
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), found.standard_error, rtol=0.02)
+    # one from columns, one from 256 groups of rays, which know an error to 4.4 %
+    ratio = np.sqrt(np.diag(covariance)) / np.asarray(found.standard_error)
+    assert np.abs(ratio - 1).max() < 0.18
+    assert abs(ratio.mean() - 1) < 0.04
 
 
 def test_sine_and_cosine_by_polynomials():
@@ -454,7 +486,6 @@ def test_gradients_are_those_of_the_same_paths(name, paths):
             jnp.asarray(np.asarray(paths.sums), jnp.float64),
             jnp.asarray(np.asarray(paths.escaped), jnp.float64),
             jnp.asarray(np.asarray(paths.hero)),
-            jnp.asarray(np.asarray(paths.node)),
         )
         start = S3.replace(bottom_reflectance=0.9)
         walked = start.layers(NM, jnp.float64)
