@@ -13,10 +13,11 @@ Two things differ from the letter of the paper (`analog`):
 - The inside of a melanosome is averaged: a hit costs its mean survival, tabulated from the literal
   trace, whatever the particle's orientation was.
 - Where theta_0 falls from 5 degrees to 0 (780 to 1300 nm), rays of a `plan` walk with the angles
-  of `NODES`, and a wavelength has one of the two around its own, so that the mean of theta_0^2,
-  which is what diffusion knows, is right: long paths that bend a little differently could not
-  serve each other otherwise. Between two nodes this changes the reflectance a little, by at most
-  0.002 in skin full of melanosomes (`adding` with the two angles and with the one between them).
+  of `NODES`, and the reflectance is a mean over those around its own, in shares that keep the mean
+  of theta_0^2, which is what diffusion knows: long paths that bend a little differently could not
+  serve each other otherwise. This changes the reflectance a little, by at most 0.002 in skin full
+  of melanosomes (`adding` with those angles and with the one between them). Where every wavelength
+  has a column of its own, it also has its own angle.
 """
 
 from __future__ import annotations

@@ -497,6 +497,10 @@ def test_a_finer_order_and_slopes_are_learned_beyond_the_table(tmp_path, quick):
         for finer in (finer_of(rows, "dispersed"), None):
             local = training.learn_locally(rows, "dispersed", finer=finer)
             log, along = local.along(names, true.rows, ways)
+            every = local.slopes(names, true.rows[:3])
+            np.testing.assert_allclose(
+                np.einsum("nwp,np->nw", every, ways[:3]), along[:3], atol=2e-5
+            )
             found = (1.0 - surface) * np.exp(log) * along
             off.append(np.sqrt(np.mean((found - change) ** 2) / np.mean(change**2)))
             light = surface + (1.0 - surface) * (np.exp(log) - module.FLOOR)
@@ -573,6 +577,22 @@ def test_ways_are_of_their_lengths_up_and_down_and_none_where_nothing_is():
     np.testing.assert_allclose(np.sqrt(np.mean(ways**2, axis=0)), lengths, rtol=1e-6)
     assert np.all(np.abs(np.mean(ways > 0, axis=0) - [0.5, 0.375, 0.5]) < 0.03)
     assert np.all(np.abs(np.corrcoef(ways.T)[np.triu_indices(3, 1)]) < 0.06)
+
+
+def test_ways_along_what_changes_little_are_longer():
+    names = ("water", "bilirubin", "melanosome_basale")
+    slope = np.array([1e-3, 1e-3, 10.0])
+
+    class Local:
+        def slopes(self, names, rows):
+            return np.broadcast_to(slope, (len(rows), 5, len(slope)))
+
+    asked = np.random.default_rng(0).uniform(0.5, 1.5, (1000, 3))
+    lengths = training._lengths(Local(), names, asked, 0)
+    own = asked[500:].std(axis=0)
+    # as far as both are of about one content, a step of that length changes the answer so much
+    np.testing.assert_allclose(lengths[:2] * slope[:2], [0.025, 0.003], rtol=0.03)
+    assert lengths[2] == own[2]
 
 
 def test_the_surface_is_that_of_the_corneum_at_each_wavelength(surrogate):
