@@ -160,7 +160,8 @@ def _chunks(paths: Paths, group: int = 1) -> Paths:
 
 
 def _group(rays: int) -> int:
-    return max(1, min(GROUP, rays // GROUPS))
+    """How many form a group: a power of two, so that `CHUNK` has whole ones."""
+    return min(GROUP, 1 << max((rays // GROUPS).bit_length() - 1, 0))
 
 
 @jax.custom_jvp

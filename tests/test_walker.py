@@ -348,6 +348,24 @@ def test_where_absorption_is_counted_changes_nothing(absorb, found, layers):
     assert np.asarray(paths.escaped).sum() > 1.2 * RAYS * float(np.mean(found.mean))
 
 
+@pytest.mark.parametrize("rays", [1, 100, 1000, 3000])
+def test_any_number_of_rays_can_be_summed(rays, paths, layers):
+    some = walker.Paths(*(part[:rays] for part in paths))
+    found = tally.collect(some, layers, layers)
+    weights = np.asarray(tally._weights(tally._weigher(layers, layers, 1.0, None), some), float)
+    np.testing.assert_allclose(found.mean, weights.mean(axis=0), rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(found.weight2, (weights**2).sum(axis=0), rtol=1e-4, atol=1e-7)
+    group = -(-rays // int(found.groups))
+    sums = [weights[i : i + group].sum(axis=0) for i in range(0, rays, group)]
+    counts = np.array([len(weights[i : i + group]) for i in range(0, rays, group)])
+    assert len(sums) == int(found.groups)
+    squares = (np.array(sums) ** 2 / counts[:, None]).sum(axis=0)
+    np.testing.assert_allclose(found.squares, squares, rtol=1e-4, atol=1e-7)
+    if rays >= 1000:
+        error = np.sqrt(weights.var(axis=0) / rays)
+        assert np.all(np.abs(np.asarray(found.standard_error) / error - 1.0) < 0.35)
+
+
 def test_the_error_falls_as_the_square_root_of_the_rays(found, layers):
     total = found
     for i in range(1, 8):
