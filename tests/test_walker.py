@@ -387,6 +387,14 @@ def test_the_same_key_gives_the_same_paths(paths, layers):
     assert not np.array_equal(paths.sums, later.sums)
 
 
+def test_a_pilot_is_the_first_of_the_rays(paths, layers):
+    few = walk(layers, jax.random.key(1), sent=100)
+    for one, all_ in zip(few, paths, strict=True):
+        np.testing.assert_array_equal(one[:100], all_[:100])
+    assert not np.asarray(few.sums)[100:].any()
+    assert not np.asarray(few.escaped)[100:].any()
+
+
 def test_both_precisions_agree(found):
     with jax.enable_x64(True):
         layers = S3.layers(NM, jnp.float64)
