@@ -41,6 +41,7 @@ from hylios_fit.spectra import Spectra, as_spectra
 from hylios_fit.threads import one_blas_thread
 
 MAX_STEPS = 100
+MORE = 3  # times as many, where the best of the searches ran out of them
 TOLERANCE = 1e-5
 """Relative and absolute, of state and objective; a state is in units of the prior's sd."""
 CONVERGED_WITHIN = 0.1
@@ -477,20 +478,30 @@ def _search(
     else:
         starts = start[None]
     filled, weights_on = jnp.asarray(filled), jnp.asarray(weights)
-    best, total = None, 0
-    for one in starts:
-        found = _solve(model.member, job.vector, weights_on, filled, jnp.asarray(one))
+    total = 0
+
+    def better(best: _Solution | None, start: np.ndarray) -> _Solution | None:
+        nonlocal total
+        found = _solve(model.member, job.vector, weights_on, filled, jnp.asarray(start))
         z, objective, jacobian, spectrum, gradient, steps = jax.device_get(found)
         total += int(steps)
-        if np.isfinite(objective) and (best is None or objective < best.objective):
-            # Distance to the minimum in posterior standard deviations, whatever stopped the search.
-            distance = np.sqrt(max(gradient @ _s_hat(jacobian) @ gradient, 0.0))
-            best = _Solution(
-                model, z, float(objective), jacobian, spectrum,
-                bool(distance < CONVERGED_WITHIN), 0, covariance, weights, log_determinant,
-            )  # fmt: skip
+        if not np.isfinite(objective) or (best is not None and objective >= best.objective):
+            return best
+        # Distance to the minimum in posterior standard deviations, whatever stopped the search.
+        distance = np.sqrt(max(gradient @ _s_hat(jacobian) @ gradient, 0.0))
+        return _Solution(
+            model, z, float(objective), jacobian, spectrum,
+            bool(distance < CONVERGED_WITHIN), 0, covariance, weights, log_determinant,
+        )  # fmt: skip
+
+    best = None
+    for one in starts:
+        best = better(best, one)
     if best is None:
         raise HyliosError("the surrogate gives no finite spectrum from any start")
+    for _ in range(MORE):  # the best goes on where its steps did not suffice
+        if not best.converged:
+            best = better(best, best.z) or best
     return replace(best, steps=total)
 
 
@@ -771,7 +782,7 @@ def _outcome(
     significant = inflation > 1.0 or model_error > 0.0
     misfit = significant and reduced > MISFIT_ABOVE
     if not converged:
-        messages.append(f"The solver found no minimum within {MAX_STEPS} steps.")
+        messages.append(f"The solver found no minimum within {(1 + MORE) * MAX_STEPS} steps.")
     if significant:
         taken = (
             f"the model to miss by {100 * model_error:.2g} % of the reflectance"

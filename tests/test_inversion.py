@@ -484,3 +484,18 @@ def test_members_in_single_precision_are_fitted_in_double():
     fit = inversion.fit((VISIBLE, values), Single(), noise=0.003)
     assert eqx.is_array_like(fit.z)
     np.testing.assert_allclose(fit.z, one(values).z, atol=0.02)
+
+
+def test_a_search_that_runs_out_of_steps_goes_on(monkeypatch):
+    # compiled anew, with few steps
+    monkeypatch.setattr(inversion, "_solve", eqx.filter_jit(inversion._solve.__wrapped__))
+    monkeypatch.setattr(inversion, "MAX_STEPS", 2)
+    values = reflectance(LIGHT, VISIBLE)[0]
+    monkeypatch.setattr(inversion, "MORE", 0)
+    short = one(values)
+    assert short.outcome is Outcome.not_converged
+    assert "no minimum within 2 steps" in short.messages[0]
+    monkeypatch.setattr(inversion, "MORE", 30)
+    found = one(values)
+    assert found.outcome is Outcome.fitted
+    assert found.iterations > short.iterations
