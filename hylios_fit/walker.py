@@ -449,6 +449,7 @@ def _sums(lane: _Lane) -> Array:
 def _walk(
     medium: _Medium,
     heroes: Array,
+    order: Array,
     key: Array,
     first: Array,
     sent: Array,
@@ -469,7 +470,7 @@ def _walk(
 
     def round_(state):
         step, lane, place, sums, escaped, left, upcoming = state
-        ray = jnp.clip(place, 0, rays - 1)
+        ray = order[jnp.clip(place, 0, rays - 1)]
         hero = heroes[ray]
         theta_0 = medium.theta_0[hero]
 
@@ -481,22 +482,22 @@ def _walk(
         step, lane = jax.lax.fori_loop(0, round_length, one, (step, lane))
         ended = (lane.phase >= ENDED) & (place < sent)
         # out-of-range places are dropped: each ray is written once, when it ends
-        target = jnp.where(ended, place, rays)
+        target = jnp.where(ended, ray, rays)
         sums = sums.at[target].set(_sums(lane), mode="drop")
         out = _number(lane.phase == ABOVE, dtype) - _number(lane.phase == BELOW, dtype)
         escaped = escaped.at[target].set(out, mode="drop")
         if exits:
             way = jnp.stack((*lane.u, *lane.place), axis=1)
             left = left.at[target].set(way, mode="drop")
-        order = upcoming + jnp.cumsum(ended, dtype=jnp.int32) - 1
-        place = jnp.where(ended, order, place).astype(jnp.int32)
+        after = upcoming + jnp.cumsum(ended, dtype=jnp.int32) - 1
+        place = jnp.where(ended, after, place).astype(jnp.int32)
         begins = ended & (place < sent)
-        new = fresh(first + place.astype(jnp.uint32))
+        new = fresh(first + order[jnp.clip(place, 0, rays - 1)].astype(jnp.uint32))
         lane = jax.tree.map(lambda n, o: jnp.where(begins, n, o), new, lane)
         return step, lane, place, sums, escaped, left, upcoming + jnp.sum(ended, dtype=jnp.int32)
 
     place = jnp.arange(lanes, dtype=jnp.int32)
-    lane = fresh(first + place.astype(jnp.uint32))
+    lane = fresh(first + order[:lanes].astype(jnp.uint32))
     state = (
         jnp.zeros((), jnp.uint32),
         lane,
@@ -575,12 +576,14 @@ def _run(
     if heroes is None:
         shares = hero_shares(layers.theta_0) if shares is None else shares
         heroes = spread(shares, bits, first, rays)
+    sent = rays if sent is None else sent
     return _walk(
         medium,
         jnp.asarray(heroes, jnp.int32),
+        jnp.asarray(_longest_first(medium, np.asarray(heroes)[:sent], rays), jnp.int32),
         bits,
         jnp.asarray(first, jnp.uint32),
-        jnp.asarray(rays if sent is None else sent, jnp.int32),
+        jnp.asarray(sent, jnp.int32),
         jnp.asarray(incidence, layers.mu_a.dtype),
         rays,
         independent,
@@ -590,6 +593,18 @@ def _run(
         min(LANES, rays),
         ROUND,
     )
+
+
+def _longest_first(medium: _Medium, heroes: np.ndarray, rays: int) -> np.ndarray:
+    """In which order the rays set out: those of columns that lose little live long, and would keep
+    the other lanes waiting at the end."""
+    columns = medium.theta_0.shape[0]
+    thickness = np.asarray(medium.thickness).reshape(7, -1)
+    each = np.asarray(medium.absorb) + np.asarray(medium.event) * (1.0 - np.asarray(medium.albedo))
+    lost = np.sum(each.reshape(7, columns) * thickness, axis=0)
+    order = np.arange(rays)
+    order[: heroes.size] = np.argsort(lost[heroes], kind="stable")
+    return order
 
 
 def node_shares(theta_0: Float[Array, "w"]) -> Float[Array, "node w"]:
