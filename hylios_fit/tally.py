@@ -280,7 +280,7 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> Arra
         borne = _product((ray * _product(scatter, lead) / mixed), density)
         new = now * (borne / jnp.sum(borne * now)) ** 0.2
         # never nothing: what the pilot missed would weigh without a bound
-        new = jnp.maximum(new, 0.1 * shares)
+        new = jnp.maximum(new, 0.2 * shares)
         return new / jnp.sum(new), best, jnp.minimum(least, largest)
 
     start = (shares, shares, jnp.asarray(jnp.inf, density.dtype))

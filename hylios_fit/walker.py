@@ -657,6 +657,8 @@ class Plan(NamedTuple):
 
 
 COLUMNS = (4, 1, 1, 1, 2, 2, 2, 2, 2, 8)  # of each node of `NODES`
+EVEN = 0.65  # power of its demand that a node's share of the rays goes with (1/2 would be best if
+# no node served another)
 LEAST_SHARE = 0.01  # of the rays, for every column that serves anything
 FEW = 0.004  # hits in a straight pass of a stratum without melanosomes
 NOTHING = 1e-12
@@ -708,7 +710,7 @@ def plan(layers: Layers, absorb: float = 0.4) -> Plan:
             chosen.append(mine[at[i]])
             mu_a.append(absorb * wide.mu_a[:, near].min(axis=1))
             albedo.append(wide.hit_albedo[:, near].max(axis=1) ** absorb)
-        shares += [total[-1] / count] * count
+        shares += [total[-1] ** EVEN / count] * count
     at = np.array(chosen)
     # where there are no melanosomes a few are met, or no path would know what the first one does
     few = np.zeros((len(LAYERS), 1))
