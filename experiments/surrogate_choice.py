@@ -16,6 +16,7 @@ import numpy as np
 from experiments import _fresh, _shared
 from hylios_fit import table, training
 from hylios_fit.perceptron import Perceptron
+from hylios_fit.surrogate import features
 from hylios_fit.threads import one_blas_thread
 
 FORM = "complex"
@@ -47,8 +48,7 @@ def run(
     progress: bool = True,
 ) -> dict[str, Any]:
     """The training of the embedded surrogate with fewer steps and specimens, of one form, and with
-    other regressions; held against the solver on specimens that none has seen. The local regression
-    learns without slopes here, the perceptrons from its own."""
+    other regressions; held against the solver on specimens that none has seen."""
     from tqdm import tqdm
 
     if data is None:
@@ -69,70 +69,44 @@ def run(
         print("local regression", flush=True)
         with one_blas_thread():
             local = training.learn_locally(data, FORM, seed, steps=local_steps)
-            lots = {"drawn": drawn, **{kind: part.rows for kind, part in held.items()}}
-            found = {}
-            for kind, rows in lots.items():
-                x, log, along = training.answers(local, names, rows, seed)
-                parts = {"x": x, "log": log, "dx": along[0], "dlog": along[1]}
-                found.update({f"{kind}/{name}": part for name, part in parts.items()})
-        return found
+        every = {kind: local(names, part.rows) for kind, part in held.items()}
+        return {"drawn": local(names, drawn), **every}
 
-    kept = _shared.kept_arrays(folder / "answers.npz", answers)
-    taught = {
-        kind: {name: kept[f"{kind}/{name}"] for name in ("x", "log", "dx", "dlog")}
-        for kind in ("drawn", *held)
-    }
+    log = _shared.kept_arrays(folder / "answers.npz", answers)
+
+    def seen(rows: np.ndarray) -> np.ndarray:
+        return np.asarray(features(names, FORM, jnp.asarray(rows, jnp.float32)), float)
 
     def rms(answers: dict[str, np.ndarray]) -> dict[str, float]:
         errors = {kind: part.errors(answers[kind]) for kind, part in held.items()}
         return {k: _shared.significant(np.sqrt(np.mean(e**2)), 3) for k, e in errors.items()}
 
-    x, log = taught["drawn"]["x"], taught["drawn"]["log"]
-    asked = {kind: taught[kind]["x"] for kind in held}
+    x, asked = seen(drawn), {kind: seen(part.rows) for kind, part in held.items()}
 
-    def learned(network: Any, slopes: bool = True) -> dict[str, Any]:
+    def learned(network: Any) -> dict[str, Any]:
         start = time.perf_counter()
-        along = (taught["drawn"]["dx"], taught["drawn"]["dlog"]) if slopes else None
-        fitted = training.fit(x, log, network, along)
+        fitted = training.fit(x, log["drawn"], network)
         widths = (x.shape[1], *network.hidden, BANDS)
-        seconds = round(time.perf_counter() - start, 1)
-        found, off = {}, {}
-        for kind in held:
-            one = taught[kind]
-            at, way = (jnp.asarray(one[name], jnp.float32) for name in ("x", "dx"))
-            value, change = jax.jvp(partial(_perceptron, fitted), (at,), (way,))
-            found[kind] = np.asarray(value)
-            square = np.mean((change - one["dlog"]) ** 2) / np.mean(one["dlog"] ** 2)
-            off[kind] = _shared.significant(np.sqrt(square), 3)
         return {
             "hidden": list(network.hidden),
-            "seconds": seconds,
+            "seconds": round(time.perf_counter() - start, 1),
             "products": sum(a * b for a, b in itertools.pairwise(widths)),
-            "rms": rms(found),
-            "slopes": off,
+            "rms": rms({kind: _perceptron(fitted, part) for kind, part in asked.items()}),
         }
 
     sizes = [Perceptron(hidden, steps, batch, seed=seed) for hidden in perceptrons]
-    networks = [
-        Adam(training.HIDDEN, ADAM * steps, batch, seed),  # longest first
-        Perceptron(training.HIDDEN, 2 * steps, batch, seed=seed),
-        *sizes[::-1],
-    ]
-    slopes = [False, False, *[True] * len(sizes)]
+    networks = [Adam(training.HIDDEN, ADAM * steps, batch, seed), *sizes[::-1]]  # longest first
     with one_blas_thread(), ThreadPoolExecutor(training.THREADS) as pool:
-        made = pool.map(learned, networks, slopes)
-        adam, plain, *made = tqdm(
-            made, total=len(networks), unit="perceptron", disable=not progress
-        )
+        made = pool.map(learned, networks)
+        adam, *made = tqdm(made, total=len(networks), unit="perceptron", disable=not progress)
     return {
         "form": FORM, **settings, "steps": steps, "batch": batch, "fresh": fresh, "bands": BANDS,
         "chosen": list(training.HIDDEN), "components": training.COMPONENTS,
-        "local": rms({kind: taught[kind]["log"] for kind in held}),
+        "local": rms(log),
         "perceptrons": made[::-1],
         "adam": {**adam, "steps": ADAM * steps},
-        "without_slopes": {**plain, "steps": 2 * steps},
-        "ridge": [_ridge(x, log, asked, degree, rms) for degree in (1, 2)],
-        "truncated": _truncated(log),
+        "ridge": [_ridge(x, log["drawn"], asked, degree, rms) for degree in (1, 2)],
+        "truncated": _truncated(log["drawn"]),
     }  # fmt: skip
 
 
@@ -162,13 +136,13 @@ class Adam:
         self.coefs_, self.intercepts_ = network.coefs_, network.intercepts_
 
 
-def _perceptron(fitted: dict[str, np.ndarray], x: Any) -> Any:
-    x = (x - fitted["centre"].astype(np.float32)) / fitted["scale"].astype(np.float32)
+def _perceptron(fitted: dict[str, np.ndarray], x: np.ndarray) -> np.ndarray:
+    x = (x - fitted["centre"]) / fitted["scale"]
     layers = sum(name.startswith("weight") for name in fitted)
     for i in range(layers):
-        x = x @ fitted[f"weight{i}"].astype(np.float32) + fitted[f"bias{i}"].astype(np.float32)
-        x = jnp.tanh(x) if i < layers - 1 else x
-    return x @ fitted["components"].astype(np.float32) + fitted["mean"].astype(np.float32)
+        x = x @ fitted[f"weight{i}"] + fitted[f"bias{i}"]
+        x = np.tanh(x) if i < layers - 1 else x
+    return x @ fitted["components"] + fitted["mean"]
 
 
 def _ridge(x: Any, log: np.ndarray, asked: Any, degree: int, rms: Any) -> dict[str, Any]:
@@ -199,47 +173,36 @@ def _truncated(log: np.ndarray) -> list[dict[str, float]]:
 
 
 def draw(result: dict[str, Any], path: Any) -> None:
-    """Errors against products, and against components."""
-    figure = _shared.figure(14, 4.6)
-    left, middle, right = figure.subplots(1, 3, width_ratios=(3, 2, 2))
+    """Error against products, and against components."""
+    figure = _shared.figure(10, 4.4)
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     labels = {"usual": "pigments, blood, water, lipids free", "every": "every parameter free"}
-    adam, plain = result["adam"], result["without_slopes"]
     for (kind, label), colour in zip(labels.items(), _shared.COLOURS, strict=False):
-        points = result["perceptrons"]
-        for axes, of, unit in ((left, "rms", 1.0), (middle, "slopes", 100.0)):
-            axes.plot(
-                [p["products"] for p in points], [unit * p[of][kind] for p in points], "o",
-                color=colour, label=f"perceptron, {label}",
+        for name, marker in (("perceptrons", "o"), ("ridge", "^")):
+            points = result[name]
+            left.plot(
+                [p["products"] for p in points], [p["rms"][kind] for p in points], marker,
+                color=colour, label=f"{name.rstrip('s')}, {label}",
             )  # fmt: skip
-            axes.plot(
-                plain["products"], unit * plain[of][kind], "s", color=colour, fillstyle="none",
-                label="by values alone in twice the steps",
-            )  # fmt: skip
-            axes.plot(
-                adam["products"], unit * adam[of][kind], "x", color=colour,
-                label=f"by values, by Adam in {adam['steps'] // result['steps']} times the steps",
-            )  # fmt: skip
+        adam = result["adam"]
         left.plot(
-            [p["products"] for p in result["ridge"]], [p["rms"][kind] for p in result["ridge"]],
-            "^", color=colour, label=f"ridge, {label}",
+            adam["products"], adam["rms"][kind], "x", color=colour,
+            label=f"by Adam in {adam['steps'] // result['steps']} times the steps",
         )  # fmt: skip
-        for point in points if kind == "usual" else ():
+        for point in result["perceptrons"] if kind == "usual" else ():
             left.annotate(
                 "-".join(map(str, point["hidden"])), (point["products"], point["rms"][kind]),
                 (-6 if len(point["hidden"]) == 2 else 2, -5), textcoords="offset points",
                 fontsize=7, rotation=90, ha="center", va="top",
             )  # fmt: skip
         left.axhline(result["local"][kind], color=colour, ls=":", lw=1)
-    for axes in (left, middle):
-        _shared.logarithmic(axes.xaxis)
-        axes.set_yscale("log")
-        axes.tick_params(axis="x", labelsize=8, rotation=30)
+    _shared.logarithmic(left.xaxis)
+    left.set_yscale("log")
     left.set_ylim(bottom=4e-5)
+    left.tick_params(axis="x", labelsize=8, rotation=30)
     left.legend(fontsize=7, loc="lower left")
     title = "dotted: what they learned from"
     _shared.tidy(left, "products for three bands", "RMS error of the reflectance", title)
-    title = "against what they learned from"
-    _shared.tidy(middle, "products for three bands", "RMS error of slopes (%)", title)
     points = result["truncated"]
     right.plot([p["components"] for p in points], [p["rms"] for p in points], "o-", ms=4)
     right.set_yscale("log")
