@@ -487,8 +487,9 @@ def test_members_in_single_precision_are_fitted_in_double():
 
 
 def test_a_search_that_runs_out_of_steps_goes_on(monkeypatch):
-    # compiled anew, with few steps
-    monkeypatch.setattr(inversion, "_solve", eqx.filter_jit(inversion._solve.__wrapped__))
+    # compiled anew, with few steps: another function, or what was compiled before would be used
+    solve = inversion._solve.__wrapped__
+    monkeypatch.setattr(inversion, "_solve", eqx.filter_jit(lambda *parts: solve(*parts)))
     monkeypatch.setattr(inversion, "MAX_STEPS", 2)
     values = reflectance(LIGHT, VISIBLE)[0]
     monkeypatch.setattr(inversion, "MORE", 0)
