@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -26,7 +25,6 @@ from experiments import _shared
 STEP_NM = 10.0
 SPECIMENS = 200
 RAYS = 131_072  # of the walker for a specimen
-THREADS = 2
 ANALOG_RAYS = 100_000
 ABSORB = 0.5  # as in `simulate`
 RANGES: Mapping[str, tuple[float, float]] = {"250-2500": (250, 2500), "400-700": (400, 700)}
@@ -74,8 +72,7 @@ def run(
         return _shared.kept_arrays(folder / f"{i:04d}.npz", make)
 
     bar = partial(tqdm, total=specimens, unit="specimen", disable=not progress)
-    with ThreadPoolExecutor(THREADS) as pool:
-        made = list(bar(pool.map(one, range(specimens)), desc="walk"))
+    made = list(bar(map(one, range(specimens)), desc="walk"))
     rng = np.random.default_rng(seed)
     rows = [
         _fits(truth, form, nm, found["reflectance"], found["covariance"], surrogate, rng)

@@ -45,7 +45,7 @@ def run(
     settings = {"seed": seed, "tolerance": tolerance, "repeats": repeats}
     found = _alone(wavelengths=nm.tolist(), specimens=specimens, **settings)
     for name in specimens:
-        lots = [cost for cost, _ in _curves(name, nm, **settings)]
+        _, *lots = [cost for cost, _ in _curves(name, nm, **settings)]
         found[name]["wall_seconds"] = _shared.significant(np.median([t for _, t in lots]), 3)
     return {
         "wavelength_nm": nm.tolist(),
@@ -69,11 +69,15 @@ if hasattr(os, "sched_setaffinity"):
 from experiments import walker_speed
 print(json.dumps(walker_speed.on_one_core(**json.load(sys.stdin))))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code], input=json.dumps(settings), stdout=subprocess.PIPE,
-        text=True, check=True, cwd=_shared.REPOSITORY,
-    )  # fmt: skip
-    return json.loads(done.stdout)
+    return json.loads(_child(code, json.dumps(settings)))
+
+
+def _child(code: str, given: str = "") -> str:
+    """What a Python process of its own prints."""
+    return subprocess.run(
+        [sys.executable, "-c", code], input=given, stdout=subprocess.PIPE, text=True, check=True,
+        cwd=_shared.REPOSITORY,
+    ).stdout  # fmt: skip
 
 
 def on_one_core(
@@ -172,16 +176,11 @@ def _peak_memory(rays: int, wavelengths: int) -> float:
 import resource, jax, numpy as np
 from hylios_fit.simulation import simulate
 from hylios_fit.skin import Specimen
-from hylios_fit.threads import cores
 nm = np.linspace(250, 2500, {wavelengths})
 simulate(Specimen.preset("S3"), nm, rays={rays}, key=jax.random.key(0))
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True,
-        cwd=_shared.REPOSITORY,
-    )  # fmt: skip
-    return _shared.significant(done.stdout)
+    return _shared.significant(_child(code))
 
 
 def draw(result: dict[str, Any], path: Any) -> None:

@@ -500,8 +500,10 @@ def _search(
     if best is None:
         raise HyliosError("the surrogate gives no finite spectrum from any start")
     for _ in range(MORE):  # the best goes on where its steps did not suffice
-        if not best.converged:
-            best = better(best, best.z) or best
+        further = best if best.converged else better(best, best.z)
+        if further is None or further is best:
+            break
+        best = further
     return replace(best, steps=total)
 
 

@@ -30,6 +30,7 @@ from hylios_fit.walker import (
 CHUNK = 512  # rays at a time, so that memory does not depend on their number
 GROUP = 64  # rays whose sum counts as one for the errors: columns take turns within it
 GROUPS = 256  # no fewer, or what they say of the errors is noise
+PILOT = 2048  # rays that `improve` looks at
 
 
 class Tally(NamedTuple):
@@ -235,9 +236,6 @@ def collect(
     squares = weight2 + still / total - still / jnp.maximum(count, 1.0)
     means = jnp.sum((count > 0).astype(total.dtype))
     return Tally(total, total - means + 1.0, weight, weight2, squares)
-
-
-PILOT = 2048  # rays that `improve` looks at
 
 
 def improve(paths: Paths, plan: Plan, asked: Layers, rays: int = PILOT) -> Plan:

@@ -50,7 +50,7 @@ from hylios_fit.table import (
     spread,
     surface_share,
 )
-from hylios_fit.threads import one_blas_thread
+from hylios_fit.threads import one_blas_thread, side_by_side
 
 FURTHER = {"index_dispersion": (-0.005, 0.035)}
 """Ranges of parameters that the table has no axis for and its indices cover."""
@@ -216,10 +216,9 @@ def solved(names: tuple[str, ...], form: str, rows: np.ndarray, bar: Any) -> np.
     """`solve` for `TOGETHER` rows at a time, side by side; `bar` counts them."""
     lots = [rows[i : i + TOGETHER] for i in range(0, len(rows), TOGETHER)]
     found = []
-    with ThreadPoolExecutor(THREADS) as pool:
-        for lot in pool.map(partial(solve, names, form), lots):
-            found.append(lot)
-            bar.update(len(lot))
+    for lot in side_by_side(partial(solve, names, form), lots):
+        found.append(lot)
+        bar.update(len(lot))
     return np.concatenate(found)
 
 
@@ -355,8 +354,7 @@ def solve_finer(table: Any, form: str, asked: np.ndarray, seed: int = 0, bar: An
     orders = ADDING_ORDER, FINE_ORDER
     found = [[solve_rows(names, lot, form, n) for n in orders] for lot in _in_stages(lots, bar)]
     coarse, fine = (np.concatenate(part) for part in zip(*found, strict=True))
-    usual = 2 * (len(asked) // 10)  # where `specimens` has them
-    slopes = solve_slopes(names, form, asked[usual : usual + STEEP], bar)
+    slopes = solve_slopes(names, form, asked[_prior(len(asked)) :][:STEEP], bar)
     return Finer(names, rows, coarse, fine, slopes)
 
 
@@ -493,9 +491,12 @@ def _ways(rows: np.ndarray, lengths: np.ndarray, generator: np.random.Generator)
     """Directions (n, P) at rows (n, P): steps up or down of about these lengths (P), between
     constant ones, as contents add up, and proportional ones, as their logarithms do. None where
     there is nothing."""
+    return generator.choice([-1.0, 1.0], rows.shape) * _steps(rows, lengths)
+
+
+def _steps(rows: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     there = np.abs(rows)
-    steps = lengths * np.sqrt(there / there.mean(axis=0))
-    return generator.choice([-1.0, 1.0], rows.shape) * steps
+    return lengths * np.sqrt(there / there.mean(axis=0))
 
 
 def _changes(
@@ -557,10 +558,10 @@ def _lengths(local: Local, names: tuple[str, ...], asked: np.ndarray, seed: int)
     """Of the steps (P) along each parameter: its spread in the prior, or more where that changes
     too little for its slope to be learned (`LEAST`)."""
     own = asked[len(asked) // 2 :].std(axis=0)
-    prior = np.arange(2 * (len(asked) // 10), len(asked))  # where `specimens` has them
+    prior = np.arange(_prior(len(asked)), len(asked))
     some = np.random.default_rng(seed + 1).choice(prior, min(LOOKED_AT, len(prior)), replace=False)
-    size = np.sqrt(np.abs(asked[some]) / np.abs(asked).mean(axis=0)) * own
-    changes = np.sqrt(np.mean((local.slopes(names, asked[some]) * size[:, None]) ** 2, (0, 1)))
+    steps = _steps(asked, own)[some, None]
+    changes = np.sqrt(np.mean((local.slopes(names, asked[some]) * steps) ** 2, axis=(0, 1)))
     least = np.array([LEAST[PRIORS[name].usual] for name in names])
     return own * np.maximum(least / np.maximum(changes, 1e-9), 1.0)
 
@@ -592,6 +593,11 @@ def specimens(table: Any, seed: int, count: int | None = None) -> np.ndarray:
         for number, (free, drawn) in enumerate(((("usual",), 3 * part), (names, count - 5 * part)))
     ]
     return np.concatenate([over, *prior])
+
+
+def _prior(count: int) -> int:
+    """Where among so many `specimens` those from the prior begin, the usual parameters free."""
+    return 2 * (count // 10)
 
 
 def fit(

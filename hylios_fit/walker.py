@@ -602,8 +602,9 @@ def _longest_first(medium: _Medium, heroes: np.ndarray, rays: int) -> np.ndarray
     thickness = np.asarray(medium.thickness).reshape(7, -1)
     each = np.asarray(medium.absorb) + np.asarray(medium.event) * (1.0 - np.asarray(medium.albedo))
     lost = np.sum(each.reshape(7, columns) * thickness, axis=0)
+    rank = np.unique(lost, return_inverse=True)[1].astype(np.uint16)  # sorted by their digits
     order = np.arange(rays)
-    order[: heroes.size] = np.argsort(lost[heroes], kind="stable")
+    order[: heroes.size] = np.argsort(rank[heroes], kind="stable")
     return order
 
 
