@@ -12,6 +12,7 @@ for parameters that act through the layers alone whether or not the table has an
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -56,16 +57,16 @@ FURTHER = {"index_dispersion": (-0.005, 0.035)}
 """Ranges of parameters that the table has no axis for and its indices cover."""
 FIRST = 3e-3
 """Hits in a straight pass that free the light which total reflection keeps in a clear epidermis."""
-LOCAL_HIDDEN = (128, 128, 128)
+LOCAL_HIDDEN = (192, 192, 192)
 LOCAL_STEPS = 40_000
 LOCAL_BATCH = 2048
 ALIKE = 100.0  # entries of a walked table whose noise is as good as one: they share paths
 TRUST = 1e-3  # error of the logarithm that rows without noise are learned to, about
-FINE_ORDER = 12  # of slopes, and of what else is solved more finely
+FINE_ORDER = 12  # of usual slopes, and of what else is solved more finely
 FINE = 256  # specimens of each form that are solved at both orders
 ORDER_STEPS = 4000
-STEEP = 256  # specimens of each form whose slopes are solved
-WAYS = 4  # in which each of them is looked at
+STEEP = 256, 128  # specimens of each form whose slopes are solved: of usual ones, of all others
+WAYS = 4, 8  # in which each of them is looked at
 LEAST = {True: 0.025, False: 0.003}
 """By how much a step along a usual parameter, or another, changes the logarithm at least."""
 LOOKED_AT = 384  # specimens that say how much it does
@@ -74,6 +75,7 @@ COMPONENTS = 80
 HIDDEN = (192, 128, 128)
 STEPS = 120_000
 BATCH = 1024
+CORNERS = 0.25  # what a specimen from all over the box weighs: the hardest, and few fits are there
 LEAST_ROWS = 64  # of each form
 CHECK_ORDER = 8  # of the solver that they are held against
 TOGETHER = 16  # of them have the same refractive indices
@@ -328,24 +330,32 @@ class Finer(NamedTuple):
     rows: Float[np.ndarray, "n P"]
     coarse: Float[np.ndarray, "n w"]  # reflectance as the table would have it
     fine: Float[np.ndarray, "n w"]
-    slopes: Slopes  # of other specimens
+    slopes: tuple[Slopes, ...]  # of other specimens
 
 
-def solve_slopes(names: tuple[str, ...], form: str, rows: np.ndarray, bar: Any = None) -> Slopes:
-    """By adding-doubling, for the usual parameters; `bar` counts `STAGES`."""
-    by = tuple(name for name in names if PRIORS[name].usual)
+def solve_slopes(
+    names: tuple[str, ...], form: str, rows: np.ndarray, bar: Any = None, every: bool = False
+) -> Slopes:
+    """By adding-doubling, for the usual parameters, or at a lower order for every one that it has a
+    derivative in; `bar` counts `STAGES`."""
+    moving = [
+        (every and not fixed) or PRIORS[name].usual
+        for name, fixed in zip(names, of_indices(names), strict=True)
+    ]
+    by = tuple(itertools.compress(names, moving))
+    order = CHECK_ORDER if every else FINE_ORDER
     found = []
     for row in _in_stages(rows, bar):
         specimen = Specimen(dict(zip(names, row.tolist(), strict=True)), form)
-        found.append(adding.slopes(specimen, WAVELENGTHS, by, order=FINE_ORDER, dtype=np.float32))
+        found.append(adding.slopes(specimen, WAVELENGTHS, by, order=order, dtype=np.float32))
     reflectance, slopes = (np.asarray(part, float) for part in zip(*found, strict=True))
     return Slopes(names, rows, reflectance, by, slopes)
 
 
 def solve_finer(table: Any, form: str, asked: np.ndarray, seed: int = 0, bar: Any = None) -> Finer:
     """Reflectances of `fresh` specimens, half with the usual parameters free and half with every
-    one; and the slopes of some that are `asked`, with the usual ones free. `bar` counts `STAGES`
-    of each.
+    one; and the slopes of some that are `asked`, with the usual ones free, and of as many more with
+    every one. `bar` counts `STAGES` of each of the three.
     """
     box = names, _, _ = box_of(table)
     key = jax.random.fold_in(jax.random.key(seed), 5)
@@ -354,7 +364,14 @@ def solve_finer(table: Any, form: str, asked: np.ndarray, seed: int = 0, bar: An
     orders = ADDING_ORDER, FINE_ORDER
     found = [[solve_rows(names, lot, form, n) for n in orders] for lot in _in_stages(lots, bar)]
     coarse, fine = (np.concatenate(part) for part in zip(*found, strict=True))
-    slopes = solve_slopes(names, form, asked[_prior(len(asked)) :][:STEEP], bar)
+    usual, every = STEEP
+    steep = fresh(*box, every, jax.random.fold_in(jax.random.key(seed), 6), names)
+    # a wavelength sees its own indices alone, whatever those of the others
+    steep[:, [names.index(name) for name in FURTHER]] = 0.0
+    slopes = (
+        solve_slopes(names, form, asked[_prior(len(asked)) :][:usual], bar),
+        solve_slopes(names, form, steep, bar, every=True),
+    )
     return Finer(names, rows, coarse, fine, slopes)
 
 
@@ -431,7 +448,11 @@ def learn_locally(
     if finer is not None:
         y = y + _order(finer, form, centre, scale, seed)(x)
         generator = np.random.default_rng([seed, 3])
-        lots = [_seen(finer.slopes, form, unit, generator) for _ in range(WAYS)]
+        lots = [
+            _seen(slopes, form, unit, generator)
+            for slopes, ways in zip(finer.slopes, WAYS, strict=True)
+            for _ in range(ways)
+        ]
         inputs, logs, *changes = (np.concatenate(part) for part in zip(*lots, strict=True))
         # what has no slopes is looked at along no way, where nothing changes
         dx, dy = (np.pad(change, ((len(x), 0), (0, 0))) for change in changes)
@@ -527,7 +548,7 @@ def _fits(
     exact = table.attrs["generator"] == "adding"
     with (
         tqdm(
-            total=(2 + 2 * exact) * len(forms) * STAGES, desc="train", unit="stage",
+            total=(2 + 3 * exact) * len(forms) * STAGES, desc="train", unit="stage",
             disable=not progress,
         ) as bar,
         one_blas_thread(),
@@ -538,7 +559,8 @@ def _fits(
             finer = solve_finer(table, form, asked, seed, bar) if exact else None
             local = learn_locally(table, form, seed, bar, finer=finer)
             x, log, along = answers(local, names, asked, seed)
-            return fit(x, log, Perceptron(HIDDEN, STEPS, BATCH, seed=seed, bar=bar), along)
+            network = Perceptron(HIDDEN, STEPS, BATCH, seed=seed, bar=bar)
+            return fit(x, log, network, along, importance(len(asked)))
 
         return dict(zip(forms, pool.map(one, forms), strict=True))
 
@@ -595,6 +617,11 @@ def specimens(table: Any, seed: int, count: int | None = None) -> np.ndarray:
     return np.concatenate([over, *prior])
 
 
+def importance(count: int) -> np.ndarray:
+    """What each of so many `specimens` counts, (count,)."""
+    return np.where(np.arange(count) < count // 10, CORNERS, 1.0)
+
+
 def _prior(count: int) -> int:
     """Where among so many `specimens` those from the prior begin, the usual parameters free."""
     return 2 * (count // 10)
@@ -605,11 +632,13 @@ def fit(
     log: np.ndarray,
     network: Any,
     along: tuple[np.ndarray, np.ndarray] | None = None,
+    weight: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
     """Standardise, reduce, regress: features (n, f), and what they give (n, w).
 
     The network is a `Perceptron`, or another with `coefs_` and `intercepts_`, not fitted yet;
-    `along`, which only the first takes, are the changes of both along one direction at each.
+    `along`, which only the first takes, are the changes of both along one direction at each, and
+    `weight` what each counts.
     Returns every number of what the surrogate evaluates, by name.
     """
     from sklearn.decomposition import PCA
@@ -621,11 +650,12 @@ def fit(
     pca: Any = PCA(min(COMPONENTS, len(x) // 4), random_state=0).fit(log)
     scores = pca.transform(log)
     unit = scores[:, 0].std()  # one scale for all, so that what matters more weighs more
-    if along is None:
-        network.fit(scaler.transform(x), scores / unit)
-    else:
-        dx, dlog = along[0] / scaler.scale_, along[1] @ pca.components_.T / unit
-        network.fit(scaler.transform(x), scores / unit, along=(dx, dlog))
+    more: dict[str, Any] = {}
+    if weight is not None:
+        more["sample_weight"] = weight
+    if along is not None:
+        more["along"] = along[0] / scaler.scale_, along[1] @ pca.components_.T / unit
+    network.fit(scaler.transform(x), scores / unit, **more)
     weights, biases = (
         [*parts[:-1], parts[-1] * unit] for parts in (network.coefs_, network.intercepts_)
     )

@@ -355,7 +355,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(training, "solve", stand_in)
     for name, value in (
         ("HIDDEN", (32, 32)), ("STEPS", 1000), ("LOCAL_HIDDEN", (24, 24)), ("LOCAL_STEPS", 2000),
-        ("SPECIMENS", 2048), ("COMPONENTS", 16), ("ORDER_STEPS", 300), ("WAYS", 1),
+        ("SPECIMENS", 2048), ("COMPONENTS", 16), ("ORDER_STEPS", 300), ("WAYS", (1, 1)),
     ):  # fmt: skip
         monkeypatch.setattr(training, name, value)
 
@@ -477,9 +477,10 @@ def slopes_of(names, form, rows):
 def finer_of(table, form, asked=None, seed=0, bar=None):
     """In the place of `training.solve_finer`."""
     box = names, _, _ = training.box_of(table)
-    drawn, steep = (training.fresh(*box, 64, jax.random.key(i)) for i in (3, 4))
+    drawn, *steep = (training.fresh(*box, n, jax.random.key(n)) for n in (64, 48, 16))
     coarse = stand_in(names, form, drawn)
-    return training.Finer(names, drawn, coarse, MORE * coarse, slopes_of(names, form, steep))
+    slopes = tuple(slopes_of(names, form, rows) for rows in steep)
+    return training.Finer(names, drawn, coarse, MORE * coarse, slopes)
 
 
 def test_a_finer_order_and_slopes_are_learned_beyond_the_table(tmp_path, quick):
@@ -538,8 +539,11 @@ def test_what_is_solved_more_finely(monkeypatch):
         def update(self, count):
             self.count += count
 
+    orders = []
+
     def slopes(specimen, wavelength_nm, by, *, order, dtype):
-        assert (order, dtype, len(wavelength_nm)) == (12, np.float32, 451)
+        orders.append(order)
+        assert (dtype, len(wavelength_nm)) == (np.float32, 451)
         assert specimen.melanosome_form == "dispersed"
         value = np.full(451, specimen.water)
         return value, np.stack([i * value for i in range(len(by))])
@@ -552,19 +556,33 @@ def test_what_is_solved_more_finely(monkeypatch):
     rows = table._empty(128, 1, 0, "adding")
     asked = training.specimens(rows, 0, 2000)
     finer = training.solve_finer(rows, "dispersed", asked, bar=(bar := Bar()))
-    assert bar.count == 2 * training.STAGES
+    assert bar.count == 3 * training.STAGES
     water = finer.names.index("water")
     np.testing.assert_array_equal(finer.coarse[:, 0], 6 * finer.rows[:, water])
     np.testing.assert_array_equal(finer.fine, 2 * finer.coarse)
     usual = (finer.rows[:, table.USUAL :] == finer.rows[0, table.USUAL :]).all(axis=1)
     assert np.flatnonzero(usual).tolist() == list(range(training.FINE // 2))
-    # from the prior with the usual parameters free
-    np.testing.assert_array_equal(finer.slopes.rows, asked[400 : 400 + training.STEEP])
-    np.testing.assert_array_equal(finer.slopes.reflectance[:, 0], finer.slopes.rows[:, water])
-    assert finer.slopes.by == finer.names[: table.USUAL]
-    np.testing.assert_array_equal(
-        finer.slopes.slopes[..., 0], np.outer(finer.slopes.rows[:, water], np.arange(table.USUAL))
-    )
+    # from the prior with the usual parameters free, and with every one
+    some, every = finer.slopes
+    assert orders == [12] * len(some.rows) + [8] * len(every.rows)
+    assert (len(some.rows), len(every.rows)) == training.STEEP
+    np.testing.assert_array_equal(some.rows, asked[400 : 400 + len(some.rows)])
+    moved = np.ptp(every.rows, axis=0) > 0.0
+    assert [n for n, m in zip(every.names, moved, strict=True) if not m] == ["index_dispersion"]
+    assert np.all(every.rows[:, ~moved] == 0.0)
+    assert some.by == finer.names[: table.USUAL]
+    assert every.by == tuple(name for name in finer.names if not name.startswith("index_"))
+    for part in finer.slopes:
+        np.testing.assert_array_equal(part.reflectance[:, 0], part.rows[:, water])
+        np.testing.assert_array_equal(
+            part.slopes[..., 0], np.outer(part.rows[:, water], np.arange(len(part.by)))
+        )
+
+
+def test_corners_of_the_box_count_less():
+    counts = training.importance(1000)
+    np.testing.assert_array_equal(counts[:100], training.CORNERS)
+    np.testing.assert_array_equal(counts[100:], 1.0)
 
 
 def test_ways_are_of_their_lengths_up_and_down_and_none_where_nothing_is():
