@@ -65,7 +65,7 @@ TRUST = 1e-3  # error of the logarithm that rows without noise are learned to, a
 FINE_ORDER = 12  # of usual slopes, and of what else is solved more finely
 FINE = 256  # specimens of each form that are solved at both orders
 ORDER_STEPS = 4000
-STEEP = 256, 128  # specimens of each form whose slopes are solved: of usual ones, of all others
+STEEP = 256, 128  # specimens of each form whose slopes are solved: usual ones free, every one free
 WAYS = 4, 8  # in which each of them is looked at
 LEAST = {True: 0.025, False: 0.003}
 """By how much a step along a usual parameter, or another, changes the logarithm at least."""
@@ -338,10 +338,7 @@ def solve_slopes(
 ) -> Slopes:
     """By adding-doubling, for the usual parameters, or at a lower order for every one that it has a
     derivative in; `bar` counts `STAGES`."""
-    moving = [
-        (every and not fixed) or PRIORS[name].usual
-        for name, fixed in zip(names, of_indices(names), strict=True)
-    ]
+    moving = ~of_indices(names) if every else [PRIORS[name].usual for name in names]
     by = tuple(itertools.compress(names, moving))
     order = CHECK_ORDER if every else FINE_ORDER
     found = []
@@ -354,8 +351,8 @@ def solve_slopes(
 
 def solve_finer(table: Any, form: str, asked: np.ndarray, seed: int = 0, bar: Any = None) -> Finer:
     """Reflectances of `fresh` specimens, half with the usual parameters free and half with every
-    one; and the slopes of some that are `asked`, with the usual ones free, and of as many more with
-    every one. `bar` counts `STAGES` of each of the three.
+    one; and the slopes of some that are `asked`, with the usual ones free, and of others with every
+    one. `bar` counts `STAGES` of each of the three.
     """
     box = names, _, _ = box_of(table)
     key = jax.random.fold_in(jax.random.key(seed), 5)
