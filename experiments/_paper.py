@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from experiments import _shared
-from hylios_fit import absorbers, melanosome
+from hylios_fit import melanosome
 from hylios_fit.exits import simulate_brdf
 from hylios_fit.sensitivity import DOMAINS, Sensitivity, sensitivity
 from hylios_fit.simulation import simulate
@@ -76,17 +76,7 @@ def _always_met(form: str) -> tuple[float, ...]:
     return (*(0.0,) * whole, whole + 1 - n, n - whole)
 
 
-def _without_tail(wavelength_nm: Any) -> dict[str, Any]:
-    """Keratin's aromatic residues alone: the table less its tail, as data/make_tables.py has it."""
-    found = _specific_absorption(wavelength_nm)
-    nm = np.asarray(wavelength_nm, float)
-    fade = 0.5 + 0.5 * np.cos(np.pi * np.clip((nm - 400.0) / 100.0, 0.0, 1.0))
-    tail = 700.0 * np.exp(-np.maximum(nm - 308.0, 0.0) / 45.0) * fade
-    return found | {"keratin": np.maximum(found["keratin"] - tail, 0.0)}
-
-
 _per_content = melanosome.attenuation_per_content
-_specific_absorption = absorbers.specific_absorption
 _DECADIC = 1.0 / math.log(10.0)
 _ETA2 = (1.5 / 1.33) ** 2
 
@@ -114,16 +104,15 @@ READINGS: Mapping[str, Reading] = {
     "oxygen saturation 0.95": Reading({"oxygen_saturation": 0.95 / 0.75}),
 }
 
-# 75,346 nucleated cells a mm2 (Hoath and Leahy 2003) of 6.6 pg each, over the model's 0.099 mm
-_DNA = 75_346 * 6.6e-9 / 0.099e-3 / DNA_MG_PER_ML[1]
-_RESIDUES = {"absorbers.specific_absorption": _without_tail}
-ULTRAVIOLET: Mapping[str, Reading] = {
-    "as taken": Reading(),
-    "keratin of its aromatic residues alone": Reading(instead=_RESIDUES),
-    "DNA from counts of cells, 5 mg/mL": Reading({"dna": _DNA}),
-    "both of these": Reading({"dna": _DNA}, instead=_RESIDUES),
+_SUPPLEMENT = Reading({"dna": 0.185 / DNA_MG_PER_ML[1]})
+ULTRAVIOLET: Mapping[str, tuple[Reading, tuple[str, ...]]] = {
+    "as taken": (Reading(), ("keratin",)),
+    "no tail of the corneum": (Reading({"corneum_tail": 0.0}), ("keratin",)),
+    "DNA of the supplement, 0.185 mg/mL": (_SUPPLEMENT, ("keratin",)),
+    "the tail goes with keratin": (Reading(), ("keratin", "corneum_tail")),
+    "both of these": (_SUPPLEMENT, ("keratin", "corneum_tail")),
 }
-"""Other inputs for the two materials whose inputs are the least sure."""
+"""Other inputs for the two materials whose inputs are the least sure, and what goes as keratin."""
 
 
 # --- measured skin, which lies outside the repository ------------------------------------------

@@ -20,7 +20,7 @@ from hylios_fit.errors import HyliosError
 FILE = "nist_skin_reflectance_odd_subjects.csv"
 SHARES = (5, 25, 50, 75, 95)
 BEYOND = (
-    "keratin", "reticular_scattering", "reticular_scattering_power", "bottom_reflectance",
+    "corneum_tail", "reticular_scattering", "reticular_scattering_power", "bottom_reflectance",
     "index_epidermis", "index_papillary", "index_reticular", "index_dispersion",
 )  # fmt: skip
 """What the published model lacks on measured skin, each off or at its value unless it is freed."""

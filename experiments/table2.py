@@ -51,8 +51,9 @@ def run() -> dict[str, Any]:
         "paper_says": SAYS,
         "we_differ": "counted is what curves of the paper's 10^5 rays at each wavelength would "
         "show, whose noise adds to an index that counts differences of either sign. Farther from "
-        f"the paper than 10 % (water, lipids) or 20 %, over the paper's: {', '.join(far)}. Right: "
-        "other inputs for DNA and keratin, the least sure; none is used, nothing is fitted",
+        f"the paper than 10 % (water, lipids) or 20 %, over the paper's: {', '.join(far)}: what "
+        "else absorbs in the ultraviolet here (the tail of the corneum, urocanic acid) leaves them "
+        "less light. Right: other inputs for DNA and keratin, the least sure; nothing is fitted",
         "specimen": "S3",
         "paper": paper,
         "indices": indices,
@@ -96,19 +97,13 @@ def _ultraviolet(skin: Specimen, nm: np.ndarray) -> dict[str, dict[str, float]]:
     low, high = DOMAINS["UV"]
     nm = nm[(nm >= low) & (nm <= high)]
     found = {}
-    for label, reading in ULTRAVIOLET.items():
-        with reading.in_force():
-            own = reading.of(skin)
-            base = _paper.reflectance(own, nm)
-            found[label] = {
-                name: _shared.significant(
-                    mean_sensitivity_index(
-                        base,
-                        _paper.reflectance(own.replace(**dict.fromkeys(REMOVALS[name], 0.0)), nm),
-                    )
-                )
-                for name in ("DNA", "keratin")
-            }
+    for label, (reading, keratin) in ULTRAVIOLET.items():
+        own = reading.of(skin)
+        base = _paper.reflectance(own, nm)
+        found[label] = {}
+        for name, gone in (("DNA", REMOVALS["DNA"]), ("keratin", keratin)):
+            without = _paper.reflectance(own.replace(**dict.fromkeys(gone, 0.0)), nm)
+            found[label][name] = _shared.significant(mean_sensitivity_index(base, without))
     return found
 
 

@@ -45,6 +45,8 @@ def specimen_of(number: int, seed: int) -> tuple[Specimen, np.ndarray]:
         values[f"index_{part}"] = skin.SPECS[f"index_{part}"].default + shift
     values |= {
         "keratin": g.uniform(0, 3),
+        "corneum_tail": g.uniform(0, 3),
+        "dna": g.uniform(0, 3),
         "methaemoglobin": g.uniform(0, 40),
         "bilirubin": g.uniform(0, 0.3),
         "fibre_fraction": g.uniform(0.05, 0.4),

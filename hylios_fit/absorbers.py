@@ -12,7 +12,7 @@ from .errors import HyliosError
 from .units import WAVELENGTH_MAX, WAVELENGTH_MIN
 
 UNITS: dict[str, str] = {
-    name: "1/cm" if name in ("water", "lipids", "keratin") else "1/cm per (mg/mL)"
+    name: "1/cm" if name in ("water", "lipids", "keratin", "corneum_tail") else "1/cm per (mg/mL)"
     for name in ABSORBERS
 } | {"urocanic_acid": "1/cm per (mol/L)"}
 """Unit of each entry of `specific_absorption`."""
@@ -23,7 +23,7 @@ def specific_absorption(wavelength_nm: ArrayLike) -> dict[str, NDArray[np.float6
 
     Each is to be multiplied by its content and added up, with no further factor ln 10: by mg/mL
     for melanins, haemoglobins, bilirubin, beta-carotene and DNA; by mol/L for urocanic acid; by the
-    fraction of the volume for water, lipids and keratin.
+    fraction of the volume for water, lipids, keratin and corneum_tail.
 
     Parameters
     ----------

@@ -28,10 +28,12 @@ ABSORBERS: tuple[str, ...] = (
     "water",
     "lipids",
     "keratin",
+    "corneum_tail",
     "dna",
     "urocanic_acid",
 )
-"""The absorbers of section 3.1 and Eq. 2 of the paper; each has data/absorbers/NAME.csv."""
+"""The absorbers of section 3.1 and Eq. 2 of the paper, and `corneum_tail`, what isolated corneum
+absorbs beyond them; each has data/absorbers/NAME.csv."""
 
 SOURCES = "SOURCES.toml"
 

@@ -35,8 +35,9 @@ STEP = 0.05  # of a range, of the differences that give the Fisher information
 TOLD_BELOW = 0.7  # posterior over prior sd of what a scene can tell
 STREAMS = ("roughness", *(name for name in SPECS if name.startswith("index_")))
 ABSENT = (
-    "water", "lipids", "keratin", "dna", "urocanic_acid", "carboxyhaemoglobin", "methaemoglobin",
-    "sulfhaemoglobin", "bilirubin", "beta_carotene", "fibre_fraction", "reticular_scattering",
+    "water", "lipids", "keratin", "corneum_tail", "dna", "urocanic_acid", "carboxyhaemoglobin",
+    "methaemoglobin", "sulfhaemoglobin", "bilirubin", "beta_carotene", "fibre_fraction",
+    "reticular_scattering",
 )  # fmt: skip
 """Parameters that at 0 leave something out, and a word of whose value is not asked."""
 

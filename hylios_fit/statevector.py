@@ -77,9 +77,10 @@ PRIORS: Mapping[str, Prior] = {
     # No population study found for the dermis: within a factor two of the default.
     "lipids": Prior(1.0, 0.35, source="assumed, within a factor of two"),
     # What follows stays at the model's value unless it is asked for. Ultraviolet absorbers: the
-    # measured ultraviolet asks for several times the tabulated keratin.
-    "keratin": Prior(1.5, 0.9, 0.3, source="assumed, one to several times the table", usual=False),
-    "dna": Prior(1.5, 0.9, 0.3, source="assumed, as keratin", usual=False),
+    # measured ultraviolet asks for 0.9 to 3 times the corneum's tail.
+    "keratin": Prior(1.0, 0.4, 0.3, source="assumed, within a factor of two", usual=False),
+    "corneum_tail": Prior(1.5, 0.9, 0.3, source="0.9 to 3 on the NIST set, wider", usual=False),
+    "dna": Prior(1.0, 0.4, 0.3, source="assumed, as keratin", usual=False),
     "urocanic_acid": Prior(1.0, 0.4, source="de Fine Olivarius 1997", usual=False),
     # Up to 1 to 2 % of the haemoglobin in health, more in smokers (Zijlstra 2000).
     "carboxyhaemoglobin": Prior(2.0, 0.7, 1.0, source="Zijlstra 2000", usual=False),

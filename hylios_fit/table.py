@@ -69,7 +69,7 @@ MELANIN = "17.9 to 72.3 % of a melanosome (Kollias et al. 1991), at the ratios o
 BLOOD = "0.2 to 4 % (Jacques 1996); port-wine stains have several times that (Barsky et al. 1980)"
 CELLS = "35 to 120 um of living epidermis (Whitton and Everall 1973; Sandby-Moller et al. 2003)"
 INDEX = "1.36 to 1.43 in vivo (Ding et al. 2006), up to what the measured near infrared asks for"
-ULTRAVIOLET = "none, to what makes up for the absorbers that the ultraviolet of NIST's set asks for"
+ULTRAVIOLET = "none, to several times what the ultraviolet of NIST's set asks for"
 DESIGN = (
     Axis("melanosome_granulosum", 0.0, 12.0, "square", MELANOSOMES, paths=True),
     Axis("melanosome_spinosum", 0.0, 12.0, "square", MELANOSOMES, paths=True),
@@ -82,8 +82,9 @@ DESIGN = (
     Axis("oxygen_saturation", 0.0, 1.0, "linear", "all that is possible"),
     Axis("water", 0.4, 1.3, "linear", "dry to oedematous, as in Blank (1952)"),
     Axis("lipids", 0.0, 3.0, "linear", "none to three times the usual"),
-    Axis("keratin", 0.0, 40.0, "cube", ULTRAVIOLET),
-    Axis("dna", 0.0, 40.0, "cube", ULTRAVIOLET),
+    Axis("keratin", 0.0, 4.0, "square", "none, to several times the usual"),
+    Axis("corneum_tail", 0.0, 20.0, "cube", ULTRAVIOLET),
+    Axis("dna", 0.0, 4.0, "square", "none, to several times the usual"),
     Axis("urocanic_acid", 0.0, 5.0, "square", "4 to 34 nmol/cm2 (de Fine Olivarius 1997)"),
     Axis("carboxyhaemoglobin", 0.0, 30.0, "square", "to 20 %, smoke poisoning (Blumenthal 2001)"),
     Axis("methaemoglobin", 0.0, 60.0, "square", "to 40 %, methaemoglobinaemia (Wright 1999)"),
