@@ -1,6 +1,7 @@
 """`python -m experiments NAME` runs and draws an experiment; `--list` names them."""
 
 import argparse
+import contextlib
 import importlib
 import inspect
 import json
@@ -10,7 +11,7 @@ import platform
 import subprocess
 import sys
 import time
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import experiments
@@ -40,7 +41,7 @@ def main() -> int:
         return 0
 
     module = importlib.import_module(f"experiments.{args.name}")
-    saved = RESULTS / f"{args.name}.json"
+    saved = RESULTS / f"{args.name}{_suffix()}.json"
     if not args.draw_only:
         _save(saved, _run(module, args.seed))
     if not saved.exists():
@@ -58,13 +59,30 @@ def _run(module, seed: int) -> dict:
         "experiment": module.__name__.rpartition(".")[2],
         "seed": seed if seeded else None,
         "python": platform.python_version(),
-        "versions": {"hylios_fit": hylios_fit.__version__} | {p: version(p) for p in PACKAGES},
+        "versions": {"hylios_fit": hylios_fit.__version__} | _versions(),
         "device": _device(),
         "commit": _commit(),
     }
     start = time.perf_counter()
     result = module.run(seed=seed) if seeded else module.run()
     return record | {"seconds": round(time.perf_counter() - start, 1), "result": result}
+
+
+def _suffix() -> str:
+    """What results of an accelerator have at the end of their name."""
+    import jax
+
+    kind = jax.default_backend()
+    return "" if kind == "cpu" else f"_{kind}"
+
+
+def _versions() -> dict[str, str]:
+    """Of what is installed: no experiment needs all of them."""
+    found = {}
+    for package in PACKAGES:
+        with contextlib.suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
 
 
 def _device() -> str:

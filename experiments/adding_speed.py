@@ -39,24 +39,31 @@ def _timed(call: Callable[[], Any]) -> tuple[float, float]:
     return times[0], float(np.median(times[1:]))
 
 
-def run(seed: int = 0, many: int = MANY, progress: bool = True) -> dict[str, Any]:
+def run(
+    seed: int = 0,
+    many: int = MANY,
+    presets: tuple[str, ...] = PRESETS,
+    orders: tuple[int, ...] = ORDERS,
+    walks: int = WALKS,
+    progress: bool = True,
+) -> dict[str, Any]:
     from tqdm import tqdm
 
     nm = wavelengths(250, 2500, 5)
     result: dict[str, Any] = {"wavelengths": len(nm), "goal": GOAL, "presets": {}}
-    for name in tqdm(PRESETS, disable=not progress):
+    for name in tqdm(presets, disable=not progress):
         layers = Specimen.preset(name).layers(nm)
         # at few wavelengths: the finest order is a matter of minutes otherwise
         few = Specimen.preset(name).layers(nm[::15])
         exact = np.asarray(adding.skin(few, order=FINEST).reflectance)
-        orders = {}
-        for order in ORDERS:
+        by_order = {}
+        for order in orders:
             error = np.abs(np.asarray(adding.skin(few, order=order).reflectance) - exact)
             found = {}
             for dtype in (jnp.float64, jnp.float32):
                 first, warm = _timed(partial(adding.skin, layers, order=order, dtype=dtype))
                 found[dtype.__name__] = {"first_s": first, "s": warm}
-            orders[str(order)] = {
+            by_order[str(order)] = {
                 "largest_error": float(error.max()),
                 "rms_error": float(np.sqrt(np.mean(error**2))),
                 **found,
@@ -65,11 +72,11 @@ def run(seed: int = 0, many: int = MANY, progress: bool = True) -> dict[str, Any
             partial(adding.slopes, Specimen.preset(name), nm, NAMES, order=adding.ORDER)
         )
         result["presets"][name] = {
-            "orders": orders,
+            "orders": by_order,
             "slopes": {"parameters": len(NAMES), "first_s": first, "s": warm},
         }
     result["many"] = _many(nm, many)
-    result["slopes"] = _slopes(nm[::5], seed)
+    result["slopes"] = _slopes(nm[::5], seed, presets, walks) if walks else {}
     return result
 
 
@@ -88,10 +95,10 @@ def _many(nm: np.ndarray, count: int) -> dict[str, Any]:
     return {"specimens": count, "s_each": took / count, "largest_reflectance": energy}
 
 
-def _slopes(nm: np.ndarray, seed: int) -> dict[str, Any]:
+def _slopes(nm: np.ndarray, seed: int, presets: tuple[str, ...], walks: int) -> dict[str, Any]:
     """Slopes of the walk against the solver's, in standard errors (independent particles)."""
     found = {}
-    for name in PRESETS:
+    for name in presets:
         specimen = Specimen.preset(name)
         _, exact = adding.slopes(specimen, nm, NAMES, order=adding.ORDER, independent=True)
         layers = specimen.layers(nm)
@@ -105,18 +112,18 @@ def _slopes(nm: np.ndarray, seed: int) -> dict[str, Any]:
 
         slopes = []
         x = jnp.asarray(specimen.parameters(NAMES), jnp.float32)
-        for number in range(WALKS):
+        for number in range(walks):
             paths = walker.walk(
                 plan.layers, specimen.melanosome_form,
                 jax.random.fold_in(jax.random.key(seed), number), rays=RAYS, independent=True,
                 shares=plan.shares,
             )  # fmt: skip
             slopes.append((1 - surface) * np.asarray(jax.jacfwd(curve)(x, paths)).T)
-        mean, error = np.mean(slopes, axis=0), np.std(slopes, axis=0, ddof=1) / np.sqrt(WALKS)
+        mean, error = np.mean(slopes, axis=0), np.std(slopes, axis=0, ddof=1) / np.sqrt(walks)
         seen = error > 0
         t = np.where(seen, (mean - np.asarray(exact)) / np.where(seen, error, 1.0), 0.0)
-        # Student's t with WALKS - 1 degrees of freedom has this mean square
-        expected = (WALKS - 1) / (WALKS - 3)
+        # Student's t with walks - 1 degrees of freedom has this mean square
+        expected = (walks - 1) / (walks - 3)
         found[name] = {
             "mean_square_t": {
                 k: float(np.mean(row[use] ** 2)) if use.any() else None

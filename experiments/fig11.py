@@ -23,7 +23,7 @@ def run(seed: int = 0, rays: int = RAYS) -> dict[str, Any]:
     skin = Specimen.preset("S2")
     medium = skin.layers(np.array([NM]))
     found, hits = [], []
-    batch = min(walker.BATCH, rays)
+    batch = min(walker.batch_rays(), rays)
     for first in range(0, rays, batch):
         paths, exits = walker.walk_out(
             medium, skin.melanosome_form, jax.random.key(seed),

@@ -53,6 +53,7 @@ def run(
         "goal_core_seconds": {k: v for k, v in GOAL_S.items() if k in found},
         "repeats": repeats,
         "cores": cores(),
+        "timed_by": "CPU seconds" if _on_cpu() else "seconds",
         "pigments": list(PIGMENTS),
         "specimens": found,
         "peak_memory_mib": {str(rays): _peak_memory(rays, len(nm)) for rays in memory_rays},
@@ -111,11 +112,17 @@ def _curves(
     return [_cost(lambda k=key: simulate(specimen, nm, tolerance=tolerance, key=k)) for key in keys]
 
 
+def _on_cpu() -> bool:
+    return jax.default_backend() == "cpu"
+
+
 def _cost(call: Callable[[], Any]) -> tuple[tuple[float, float], Any]:
-    """(processor seconds of all threads, wall seconds), and what was made."""
+    """(processor seconds of all threads, wall seconds), and what was made; on an accelerator both
+    are wall seconds."""
     wall, busy = time.perf_counter(), time.process_time()
     made = jax.block_until_ready(call())
-    return (time.process_time() - busy, time.perf_counter() - wall), made
+    seconds = time.perf_counter() - wall
+    return (time.process_time() - busy if _on_cpu() else seconds, seconds), made
 
 
 def _median(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:
@@ -127,7 +134,7 @@ def _parts(specimen: Specimen, nm: np.ndarray, key: jax.Array, repeats: int) -> 
     """One batch: what its walk, its sums and its gradients cost."""
     medium = specimen.layers(nm)
     to_plan, plan = _median(lambda: walker.plan(medium), repeats)
-    rays = walker.BATCH
+    rays = walker.batch_rays()
 
     def walk():
         return walker.walk(
@@ -171,14 +178,16 @@ def _parts(specimen: Specimen, nm: np.ndarray, key: jax.Array, repeats: int) -> 
 
 
 def _peak_memory(rays: int, wavelengths: int) -> float:
-    """Largest resident memory of a process that simulates, in MiB."""
+    """Largest resident memory of a process that simulates, or of its device, in MiB."""
     code = f"""
 import resource, jax, numpy as np
 from hylios_fit.simulation import simulate
 from hylios_fit.skin import Specimen
 nm = np.linspace(250, 2500, {wavelengths})
 simulate(Specimen.preset("S3"), nm, rays={rays}, key=jax.random.key(0))
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+stats = jax.devices()[0].memory_stats() or {{}}
+peak = stats.get("peak_bytes_in_use", 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+print(peak / 1024**2)
 """
     return _shared.significant(_child(code))
 
@@ -203,7 +212,8 @@ def draw(result: dict[str, Any], path: Any) -> None:
             bars.plot([i - 0.4, i + 0.4], [goal, goal], color="black", ls="--", lw=1)
     bars.set_xticks(range(len(names)), names)
     bars.margins(y=0.25)
-    _shared.tidy(bars, "", "core-seconds, warm", "one curve (dashed: goal)")
+    unit = "core-seconds" if result["timed_by"] == "CPU seconds" else "seconds"
+    _shared.tidy(bars, "", f"{unit}, warm", "one curve (dashed: goal)")
     errors.axhline(result["tolerance"], color="black", ls="--", lw=1)
     errors.set_ylim(bottom=0)
     errors.legend(fontsize=8)

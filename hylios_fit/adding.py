@@ -151,14 +151,15 @@ def _fibres(absorption, fibre, thickness, even, cosine):
     return rate * _mean_decay(before + after), straight + rate * on
 
 
-BLOCK = 32  # wavelengths at a time: what they need stays in the cache, and memory is bounded
+# wavelengths at a time: what they need stays in the cache, and memory is bounded
+BLOCK, ACCELERATOR_BLOCK = 32, 8192
 
 
 @partial(jax.jit, static_argnames=("kinds", "counts", "inner"))
 def _solve(c: Coefficients, optics: Optics, which: Array, kinds, counts, inner: bool):
     """(back, absorbed (m, w), bottom (w,)) in shares of the light that entered."""
     w = which.size
-    size = min(BLOCK, w)
+    size = min(BLOCK if jax.default_backend() == "cpu" else ACCELERATOR_BLOCK, w)
     padding = -w % size
 
     def blocks(a, axis):

@@ -263,7 +263,7 @@ def _walk(
     medium = specimen.layers(nm)
     plan, own_only = walker.plan_or_own(medium, ABSORB)
     angle = math.radians(incidence)
-    batch = min(walker.BATCH, rays)
+    batch = min(walker.batch_rays(), rays)
 
     def lot(first: int) -> tuple[np.ndarray, ...]:
         paths, exits = walker.walk_out(

@@ -17,7 +17,8 @@ from hylios_fit.threads import side_by_side
 from hylios_fit.units import WAVELENGTH_MAX, WAVELENGTH_MIN
 
 METHODS = ("walker", "analog", "adding", "surrogate")
-FIRST = 2  # batches before a tolerance is asked for
+FIRST = 2  # batches (of `walker.BATCH`) before a tolerance is asked for
+GRAIN = 1024  # rays that a tolerance asks for come in multiples of this
 MOST_RAYS = 20_000_000  # where a tolerance stops asking for more
 ANALOG_BATCH = 4096
 ABSORB = 0.5  # see `walker.walk`: the answer does not depend on it, the cost does
@@ -94,7 +95,7 @@ def with_covariance(
     """
     layers = specimen.layers(nm)
     angle = math.radians(incidence)
-    batch = min(walker.BATCH, rays)
+    batch = min(walker.batch_rays(), rays)
 
     def lot(first: int) -> tuple[np.ndarray, np.ndarray]:
         paths = walker.walk(
@@ -135,36 +136,44 @@ def _walked(
     specimen, medium, nm, surface, rays, key, angle, tolerance, independent, progress
 ) -> Curve:
     plan, own_only = walker.plan_or_own(medium, ABSORB)
-    batch = min(walker.BATCH, rays) if tolerance is None else walker.BATCH
+    batch = walker.batch_rays()
+    if tolerance is None:
+        batch = min(batch, rays)
     walk = partial(
         walker.walk, form=specimen.melanosome_form, incidence=angle, rays=batch,
         independent=independent,
     )  # fmt: skip
-    if batch == walker.BATCH and not own_only:
+    if batch >= walker.BATCH and not own_only:
         other = jax.random.fold_in(key, 1)
         pilot = walk(plan.layers, key=other, shares=plan.shares, sent=tally.PILOT)
         plan = tally.improve(pilot, plan, medium)
 
-    def lot(first: int) -> tally.Tally:
-        paths = walk(plan.layers, key=key, first=first, shares=plan.shares)
-        return tally.collect(paths, plan.layers, medium, own_only=own_only, shares=plan.shares)
+    def lot(part: tuple[int, int]) -> tally.Tally:
+        first, many = part
+        paths = walk(plan.layers, key=key, first=first, shares=plan.shares, sent=many)
+        return tally.collect(
+            paths, plan.layers, medium, own_only=own_only, shares=plan.shares, sent=many
+        )
 
-    total, sent, more = None, 0, math.ceil(rays / batch) if tolerance is None else FIRST
+    total, sent = None, 0
+    more = math.ceil(rays / batch) * batch if tolerance is None else FIRST * walker.BATCH
     with progress_bar(rays if tolerance is None else None, progress) as bar:
         while more:
             if tolerance is not None:
-                more = min(more, math.ceil((MOST_RAYS - sent) / batch))
-            for found in side_by_side(lot, range(sent, sent + more * batch, batch)):
+                more = min(more, MOST_RAYS - sent)
+            lots = [(i, min(batch, sent + more - i)) for i in range(sent, sent + more, batch)]
+            for found in side_by_side(lot, lots):
                 total = tally.add(total, found)
-                bar.update(batch)
-            sent += more * batch
+            bar.update(more)
+            sent += more
             assert total is not None
             error = (1.0 - surface) * np.asarray(total.standard_error, float)
             more = 0
             if tolerance is not None and np.max(error) > tolerance and sent < MOST_RAYS:
-                # most of what is missing, as the error itself is an estimate
-                missing = (np.max(error) / tolerance) ** 2 - 1.0
-                more = max(math.floor(0.9 * missing * sent / batch), 1)
+                # a little less, and at last a little more than is missing: the error is an estimate
+                missing = ((np.max(error) / tolerance) ** 2 - 1.0) * sent
+                share = 0.9 if missing > batch else 1.02
+                more = math.ceil(share * missing / GRAIN) * GRAIN
     assert total is not None
     inside = (1.0 - surface) * np.asarray(total.mean, float)
     return Curve(

@@ -48,8 +48,8 @@ NODES = scattering.LATIMER_ANGLE * np.sqrt(
 )
 APART = 0.25  # of the gaps between their squares: no further error where that is largest
 ROUND = 8  # steps between two exchanges of rays that ended
-LANES = 1024
-BATCH = 32_768  # rays of one compiled call; memory does not depend on the number of rays
+LANES, ACCELERATOR_LANES = 1024, 1 << 17
+BATCH, ACCELERATOR_BATCH = 32_768, 1 << 19  # rays of one compiled call (`batch_rays`)
 
 
 class Paths(NamedTuple):
@@ -590,9 +590,14 @@ def _run(
         form == "dispersed",
         exits,
         LAYERS.index(last),
-        min(LANES, rays),
+        min(LANES if jax.default_backend() == "cpu" else ACCELERATOR_LANES, rays),
         ROUND,
     )
+
+
+def batch_rays() -> int:
+    """Rays of one compiled call: memory does not depend on how many there are in all."""
+    return BATCH if jax.default_backend() == "cpu" else ACCELERATOR_BATCH
 
 
 def _longest_first(medium: _Medium, heroes: np.ndarray, rays: int) -> np.ndarray:
