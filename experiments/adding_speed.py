@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import _shared
-from hylios_fit import adding, skin, tally, walker
+from hylios_fit import adding, scattering, skin, tally, walker
 from hylios_fit.skin import Specimen
 from hylios_fit.table import NAMES as DESIGNED
 from hylios_fit.table import design, layers_of
@@ -27,6 +27,7 @@ REPEATS = 3
 WALKS = 8  # of the slopes, for their standard error
 RAYS = 65_536
 GOAL = 1e-4
+LEAST = 1e-4  # change of the reflectance over a parameter's whole range that a slope is of interest
 
 
 def _timed(call: Callable[[], Any]) -> tuple[float, float]:
@@ -96,7 +97,8 @@ def _many(nm: np.ndarray, count: int) -> dict[str, Any]:
 
 
 def _slopes(nm: np.ndarray, seed: int, presets: tuple[str, ...], walks: int) -> dict[str, Any]:
-    """Slopes of the walk against the solver's, in standard errors (independent particles)."""
+    """Slopes of the walk against the solver's, in standard errors (independent particles), where
+    they are of interest: the few paths that tell of less say nothing of their own error."""
     found = {}
     for name in presets:
         specimen = Specimen.preset(name)
@@ -120,16 +122,32 @@ def _slopes(nm: np.ndarray, seed: int, presets: tuple[str, ...], walks: int) -> 
             )  # fmt: skip
             slopes.append((1 - surface) * np.asarray(jax.jacfwd(curve)(x, paths)).T)
         mean, error = np.mean(slopes, axis=0), np.std(slopes, axis=0, ddof=1) / np.sqrt(walks)
-        seen = error > 0
-        t = np.where(seen, (mean - np.asarray(exact)) / np.where(seen, error, 1.0), 0.0)
-        # Student's t with walks - 1 degrees of freedom has this mean square
-        expected = (walks - 1) / (walks - 3)
+        exact = np.asarray(exact, float)
+        width = np.array([axis.upper - axis.lower for axis in _shared.PIGMENTS])[:, None]
+        seen = (np.abs(exact) * width > LEAST) & (error > 0)
+        t = np.where(seen, (mean - exact) / np.where(seen, error, 1.0), 0.0)
+        angle = scattering.melanosome_angle(nm)
+        falls = (angle > 0) & (angle < scattering.LATIMER_ANGLE)
         found[name] = {
             "mean_square_t": {
-                k: float(np.mean(row[use] ** 2)) if use.any() else None
-                for k, row, use in zip(NAMES, t, seen, strict=True)
+                label: {
+                    k: _shared.significant(np.mean(row[use & where] ** 2), 3)
+                    for k, row, use in zip(NAMES, t, seen, strict=True)
+                    if (use & where).any()
+                }
+                for label, where in (("own angle", ~falls), ("mean over angles", falls))
             },
-            "expected": expected,
+            # Student's t with walks - 1 degrees of freedom has this mean square
+            "expected": (walks - 1) / (walks - 3),
+            "compared": {k: int(use.sum()) for k, use in zip(NAMES, seen, strict=True)},
+            "rms_difference_over_slope": {
+                k: _shared.significant(np.sqrt(np.mean(d**2) / np.mean(e**2)), 2)
+                for k, d, e in zip(NAMES, mean - exact, exact, strict=True)
+            },
+            "rms_error_over_slope": {
+                k: _shared.significant(np.sqrt(np.mean(d**2) / np.mean(e**2)), 2)
+                for k, d, e in zip(NAMES, error, exact, strict=True)
+            },
         }
     return found
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 METHODS = ("walker", "analog", "adding", "surrogate")
 SIMULATION_HEADER = ("wavelength_nm", "reflectance", "standard_error", "surface", "subsurface")
-SENSITIVITY_HEADER = ("material", "domain", "msi")
+SENSITIVITY_HEADER = ("material", "domain", "msi", "msi_counted")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -126,7 +126,8 @@ def _parser() -> argparse.ArgumentParser:
         "--counted",
         type=_count,
         metavar="N",
-        help="the index that curves of N counted rays would show; the paper's are of 100000",
+        default=100_000,
+        help="rays of the curves whose index msi_counted is; default: 100000, the paper's",
     )
     _seed(sensitivity)
 
@@ -316,7 +317,12 @@ def _sensitivity(args: argparse.Namespace) -> int:
         progress=True,
         **({} if args.rays is None else {"rays": args.rays}),
     )
-    rows = [(material, domain, f"{msi:.4g}") for material, domain, msi in found.rows(args.counted)]
+    rows = [
+        (material, domain, f"{msi:.4g}", f"{counted:.4g}")
+        for (material, domain, msi), (*_, counted) in zip(
+            found.rows(), found.rows(args.counted), strict=True
+        )
+    ]
     write_csv(output, SENSITIVITY_HEADER, rows)
     return _wrote(output)
 

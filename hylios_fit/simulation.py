@@ -13,7 +13,7 @@ import numpy as np
 from hylios_fit import adding, analog, fresnel, skin, tally, walker
 from hylios_fit.errors import HyliosError
 from hylios_fit.skin import Specimen
-from hylios_fit.threads import side_by_side
+from hylios_fit.threads import cores, side_by_side
 from hylios_fit.units import WAVELENGTH_MAX, WAVELENGTH_MIN
 
 METHODS = ("walker", "analog", "adding", "surrogate")
@@ -161,7 +161,11 @@ def _walked(
         while more:
             if tolerance is not None:
                 more = min(more, MOST_RAYS - sent)
-            lots = [(i, min(batch, sent + more - i)) for i in range(sent, sent + more, batch)]
+            each = batch
+            if tolerance is not None:  # as many lots as keep all cores busy to the end
+                many = math.ceil(more / batch / cores()) * cores()
+                each = math.ceil(more / many / GRAIN) * GRAIN
+            lots = [(i, min(each, sent + more - i)) for i in range(sent, sent + more, each)]
             for found in side_by_side(lot, lots):
                 total = tally.add(total, found)
             bar.update(more)

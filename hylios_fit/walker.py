@@ -49,7 +49,7 @@ NODES = scattering.LATIMER_ANGLE * np.sqrt(
 APART = 0.25  # of the gaps between their squares: no further error where that is largest
 ROUND = 8  # steps between two exchanges of rays that ended
 LANES, ACCELERATOR_LANES = 1024, 1 << 17
-BATCH, ACCELERATOR_BATCH = 32_768, 1 << 19  # rays of one compiled call (`batch_rays`)
+BATCH, ACCELERATOR_BATCH = 65_536, 1 << 19  # rays of one compiled call (`batch_rays`)
 
 
 class Paths(NamedTuple):

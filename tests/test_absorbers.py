@@ -214,11 +214,19 @@ def test_keratin():
     assert abs(peak("keratin", 260, 300) - 278) <= 1
     grid = np.arange(282.0, 500.0, 2.0)
     assert np.all(np.diff(specific_absorption(grid)["keratin"]) <= 0)
-    # Isolated stratum corneum, van Gemert 1989: 600 per cm at 308 nm, 330 at 337 nm, all absorbers.
-    corneum = 0.65 * at("keratin", 308, 337) + 0.01 * at("urocanic_acid", 308, 337)
+    # no aromatic residue absorbs beyond
+    assert np.all(at("keratin", 350, 400, 2500) == 0)
+
+
+def test_isolated_corneum_absorbs_as_measured():
+    # van Gemert 1989: 600 per cm at 308 nm, 330 at 337 nm, all absorbers.
+    dry = np.add(*(at(name, 308, 337) for name in ("keratin", "corneum_tail")))
+    corneum = 0.65 * dry + 0.01 * at("urocanic_acid", 308, 337)
     assert 400 < corneum[0] < 700
     assert 150 < corneum[1] < 330
-    assert np.all(at("keratin", 500, 600, 2500) == 0)
+    grid = np.arange(250.0, 600.0, 2.0)
+    assert np.all(np.diff(specific_absorption(grid)["corneum_tail"]) <= 0)
+    assert np.all(at("corneum_tail", 500, 600, 2500) == 0)
 
 
 # --- water and lipids ---------------------------------------------------------------------------

@@ -96,15 +96,16 @@ def saved(name):
 def test_table_ii_comes_out_as_the_readme_says():
     result = saved("table2")
     own, counted = (result["over_paper"][label] for label in ("as taken", "as taken, counted"))
-    for material in ("melanin", "blood", "water"):
+    for material in ("melanin", "blood", "water", "lipids"):
         aim = result["aims"][material]
         for ratio in counted[material].values():
             assert abs(ratio - 1) < aim
-    # what falls short: lipids by a little, DNA and keratin in the wrong order
-    assert all(0.10 < 1 - ratio < 0.15 for ratio in counted["lipids"].values())
+    # without the noise blood falls short; DNA and keratin are in order, and too small
     assert all(0.75 < ratio < 0.81 for ratio in own["blood"].values())
+    assert all(own[name]["UV"] < 0.5 for name in ("DNA", "keratin"))
     order = {k: own["DNA"] > own["keratin"] for k, own in result["ultraviolet"].items()}
-    assert [label for label, right in order.items() if right] == ["both of these"]
+    right = ["as taken", "no tail of the corneum"]
+    assert [label for label, is_right in order.items() if is_right] == right
 
 
 def test_figure_8_comes_out_as_the_readme_says():

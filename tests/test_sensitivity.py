@@ -176,28 +176,30 @@ def test_the_command_writes_a_row_for_each_material_and_domain(tmp_path, monkeyp
     assert capsys.readouterr().out == f"wrote {path}\n"
     with open(path, encoding="utf-8", newline="") as stream:
         header, *rows = csv.reader(stream)
-    assert header == ["material", "domain", "msi"]
+    assert header == ["material", "domain", "msi", "msi_counted"]
     assert [row[0] for row in rows[::4]] == list(ORDER)
     assert [row[1] for row in rows[:4]] == list(DOMAINS)
     assert {row[0] for row in rows if float(row[2])} == {"water"}
-    assert rows[18] == ["water", "IR", "0.6667"]
+    assert rows[18][:3] == ["water", "IR", "0.6667"]
     specimen, method, _, given = seen[0]
     assert (specimen.blood_papillary, method) == (2.0, "walker")
     assert given["rays"] == 9
     assert given["incidence"] == 45.0
 
 
-def test_the_command_solves_without_noise_and_adds_it_when_asked(tmp_path, monkeypatch):
+def test_the_command_solves_without_noise_and_says_what_it_would_add(tmp_path, monkeypatch):
     seen = asked(monkeypatch, lambda specimen, nm: 0.2)
     path = tmp_path / "msi.csv"
     assert cli.main(["sensitivity", "S3", "-o", str(path)]) == 0
     assert {method for _, method, *_ in seen} == {"adding"}
-    assert {line.rpartition(",")[2] for line in path.read_text().splitlines()[1:]} == {"0"}
-    assert cli.main(["sensitivity", "S3", "-o", str(path), "--counted", "100000"]) == 0
-    # two counts of 20,000 in 100,000: 2/sqrt(pi) times the error of one, over 0.2
+    # two counts of a fifth of the rays: 2/sqrt(pi) times the error of one, over 0.2
     noise = 2 / np.sqrt(np.pi) * np.sqrt(0.2 * 0.8 / 100_000) / 0.2
-    for line in path.read_text().splitlines()[1:]:
-        assert float(line.rpartition(",")[2]) == pytest.approx(noise, rel=1e-3)
+    for argv, factor in (([], 1), (["--counted", "400000"], 2)):
+        assert cli.main(["sensitivity", "S3", "-o", str(path), *argv]) == 0
+        for line in path.read_text().splitlines()[1:]:
+            *_, msi, counted = line.split(",")
+            assert msi == "0"
+            assert float(counted) == pytest.approx(noise / factor, rel=1e-3)
 
 
 @pytest.mark.parametrize("argv", [["S9"], ["S3", "--set", "water=9"], ["S3", "--method", "guess"]])

@@ -181,7 +181,7 @@ def test_the_papillary_absorption_is_equation_2_by_hand(x64):
     epidermis = (
         0.60 * zeta["water"]
         + 0.151 * zeta["lipids"]
-        + 0.185 * zeta["dna"]
+        + 5.0 * zeta["dna"]
         + 2.1e-4 * zeta["beta_carotene"]
         + 0.0125 * melanin
     )
@@ -190,7 +190,7 @@ def test_the_papillary_absorption_is_equation_2_by_hand(x64):
     corneum = (
         0.35 * zeta["water"]
         + 0.20 * zeta["lipids"]
-        + 0.65 * zeta["keratin"]
+        + 0.65 * (zeta["keratin"] + zeta["corneum_tail"])
         + 0.01 * zeta["urocanic_acid"]
         + 2.1e-4 * zeta["beta_carotene"]
     )
