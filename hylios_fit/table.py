@@ -45,7 +45,7 @@ GROUPS = 8  # sets of paths of one melanosome form that walk together
 GENERATORS = ("walker", "adding")
 ADDING_ORDER = 6  # of what `adding` stores
 ADDING_PARTS = (6, 8, 5, 5, 5)  # its streams in every row, so that no indices need compiling anew
-ADDING_CHECK = 12  # the order that the first row of each chunk and form is held against
+ADDING_CHECK = 12  # the order that says how much it errs
 WAIT = 0.2  # seconds between looks at what another process is at
 ABSORB = 0.5  # share of the absorption that ends rays on the way (the rest is in the weights)
 INCIDENCE_DEG = 8.0
@@ -266,11 +266,17 @@ def walk_rows(
 def add_rows(parameters: np.ndarray, form: str) -> tuple[np.ndarray, np.ndarray]:
     """As `walk_rows`, by the deterministic solver.
 
-    The error of all rows is that of the first: what a higher order changes.
+    The error of all rows is that of the usual specimen: what a higher order changes.
     """
     reflectance = solve_rows(NAMES, parameters, form)
-    error = np.abs(reflectance[:1] - solve_rows(NAMES, parameters[:1], form, ADDING_CHECK))
-    return reflectance, np.broadcast_to(error, reflectance.shape)
+    return reflectance, np.broadcast_to(_order_error(form), reflectance.shape)
+
+
+@lru_cache(maxsize=4)
+def _order_error(form: str) -> np.ndarray:
+    usual = Specimen().parameters(NAMES)[None]
+    coarse, fine = (solve_rows(NAMES, usual, form, n) for n in (ADDING_ORDER, ADDING_CHECK))
+    return np.abs(coarse - fine)
 
 
 def solve_rows(

@@ -137,6 +137,16 @@ def _circle(u: Array) -> tuple[Array, Array]:
     return _cos_sin((u - 0.5) * math.pi)
 
 
+COMPILED = {
+    "xla_cpu_prefer_vector_width": 512,  # a third faster where there is AVX-512
+    # what `_keep` divides by is inverted once: a tenth faster; NaN and infinity stay what they are
+    "xla_cpu_enable_fast_math": True,
+    "xla_cpu_fast_math_honor_division": False,
+    "xla_cpu_fast_math_honor_nans": True,
+    "xla_cpu_fast_math_honor_infs": True,
+    "xla_cpu_fast_math_honor_functions": True,
+}
+
 FLYING, AGAIN, WAITING, ENDED, ABOVE, BELOW = range(6)
 """Phase of a ray: on its way; to draw its scattering angle again; at an interface; over."""
 
@@ -444,7 +454,7 @@ def _sums(lane: _Lane) -> Array:
 @partial(
     jax.jit,
     static_argnames=("rays", "independent", "spheroid", "exits", "below", "lanes", "round_length"),
-    compiler_options={"xla_cpu_prefer_vector_width": 512},  # a third faster where there is AVX-512
+    compiler_options=COMPILED,
 )
 def _walk(
     medium: _Medium,

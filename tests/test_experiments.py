@@ -20,6 +20,7 @@ NAMES = (
     "walker_speed", "surrogate_speed", "speed_accuracy", "plan", "surrogate_error",
     "surrogate_choice", "table_noise", "model_error",
 )  # fmt: skip
+ON_A_GPU = tuple(path.stem for path in sorted(RESULTS.glob("*_gpu.json")))
 
 
 @pytest.fixture
@@ -36,18 +37,19 @@ def is_png(path):
     return path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 5_000
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *ON_A_GPU])
 def test_a_saved_result_names_its_origin_and_is_all_that_the_figure_needs(name, tmp_path):
     path = RESULTS / f"{name}.json"
     if not path.exists():
         pytest.skip(f"no saved result: run `python -m experiments {name}`")
     record = json.loads(path.read_text(encoding="utf-8"))
-    assert record["experiment"] == name
+    experiment = name.removesuffix("_gpu")
+    assert record["experiment"] == experiment
+    assert record["device"].startswith("gpu" if name in ON_A_GPU else "cpu")
     assert {"seed", "python", "seconds", "result"} <= record.keys()
-    module = importlib.import_module(f"experiments.{name}")
-    assert (record["seed"] is None) == (name in ("nist", "model_error")), "they draw nothing"
+    module = importlib.import_module(f"experiments.{experiment}")
+    assert (record["seed"] is None) == (experiment in ("nist", "model_error")), "they draw nothing"
     assert {"hylios_fit", "jax", "numpy", "optimistix"} <= record["versions"].keys()
-    assert record["device"]
     assert len(record["commit"].split("+")[0]) == 40
     assert path.stat().st_size < 300_000
     assert path.with_suffix(".png").stat().st_size < 400_000
