@@ -31,7 +31,7 @@ from hylios_fit.errors import HyliosError
 from hylios_fit.skin import LAYERS, SPECS, STRATA, Specimen
 
 FORMAT = "hylios_fit surrogate"
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 FLOOR = 0.3
 """Added to the subsurface reflectance before the logarithm: errors are less than relative."""
 
