@@ -28,17 +28,17 @@ from hylios_fit.walker import (
 )
 
 CHUNK = 512  # rays at a time, so that memory does not depend on their number
-GROUP = 32  # rays that came back whose sum counts as one for the errors: columns take turns in it
-GROUPS = 256  # about so many at least, or what they say of the errors is noise
+GROUP = 64  # rays whose sum counts as one for the errors: columns take turns within it
+GROUPS = 256  # no fewer, or what they say of the errors is noise
 PILOT = 2048  # rays that `improve` looks at
 
 
 class Tally(NamedTuple):
     """Sums over rays that entered the skin; w wavelengths.
 
-    `squares` has the squared sum of the weights of each group of rays, over the number that set out
-    for it: columns take turns among the rays, so that only the scatter between groups is error.
-    `groups` is their number.
+    `squares` has the squared sum of the weights of each group of rays, over their number: columns
+    take turns among the rays, so that only the scatter between groups is error. `groups` is their
+    number.
     """
 
     rays: Float[Array, ""]
@@ -145,10 +145,10 @@ def _sum_own_weights(weigher: _Weigher, paths: Paths, columns: int) -> tuple[Arr
     return total[:, 0], total[:, 1]
 
 
-def _chunks(paths: Paths) -> Paths:
-    """The rays by `CHUNK`; what fills the last one never came out."""
+def _chunks(paths: Paths, group: int = 1) -> Paths:
+    """The rays by `CHUNK`, whole groups; what fills the last one never came out."""
     rays = paths.hero.shape[0]
-    size = min(CHUNK, rays)
+    size = min(CHUNK, rays + -rays % group)
     padding = -rays % size
     return Paths(
         *(
@@ -161,55 +161,48 @@ def _chunks(paths: Paths) -> Paths:
 
 
 def _group(rays: int) -> int:
-    """How many that came back form a group: a power of two, so that `CHUNK` has whole ones."""
-    return min(GROUP, 1 << max((rays // (2 * GROUPS)).bit_length() - 1, 0))
+    """How many form a group: a power of two, so that `CHUNK` has whole ones."""
+    return min(GROUP, 1 << max((rays // GROUPS).bit_length() - 1, 0))
 
 
 @jax.custom_jvp
-def _sum_weights(weigher: _Weigher, paths: Paths, sent: Array) -> tuple[Array, Array, Array, Array]:
-    """(w,) sums of the weights, of their squares, and of the squares of groups over their rays; and
-    the number of groups."""
-    return _moments(weigher, paths, sent)[:4]
+def _sum_weights(weigher: _Weigher, paths: Paths, sent: Array) -> tuple[Array, Array, Array]:
+    """(w,) sums of the weights, of their squares, and of the squares of groups over their rays."""
+    return _moments(weigher, paths, sent)[:3]
 
 
 def _moments(weigher: _Weigher, paths: Paths, sent: Array, sums: bool = False):
     width, dtype = weigher.asked.shape[1], weigher.asked.dtype
-    rays = paths.hero.shape[0]
-    group = _group(rays)
-    size = min(CHUNK, rays + -rays % group)
-    back = paths.escaped > 0
-    # those that came back, in turn: nothing is worked out for the others
-    place = jnp.flatnonzero(back, size=rays + -rays % size, fill_value=rays)
-    ends = jnp.minimum(place[group - 1 :: group] + 1, sent)
-    each = jnp.diff(ends, prepend=0)  # how many set out for each group
+    group = _group(paths.hero.shape[0])
+    chunks = _chunks(paths, group)
+    number, size = chunks.hero.shape
+    first = jnp.arange(number * size // group, dtype=sent.dtype).reshape(number, -1) * group
+    # groups beyond the last ray that set out are empty
+    each = jnp.clip(sent - first, 1, group).astype(dtype)
 
-    def part(number, carry):
-        some = jax.lax.dynamic_slice_in_dim(place, number * size, size)
-        lot = Paths(*(a.at[some].get(mode="fill", fill_value=0) for a in paths))
+    def part(carry, chunk):
+        lot, rays = chunk
         weight = _weights(weigher, lot)
         grouped = jnp.sum(weight.reshape(-1, group, width), axis=1)
-        out = jax.lax.dynamic_slice_in_dim(each, number * size // group, size // group)
-        shared = grouped**2 / jnp.maximum(out, 1).astype(dtype)[:, None]
         w, w2, squares, by_sum = carry
         if sums:
             by_sum = by_sum + _product(lot.sums.T, weight)
         w, w2 = w + jnp.sum(grouped, axis=0), w2 + jnp.sum(weight**2, axis=0)
-        return w, w2, squares + jnp.sum(shared, axis=0), by_sum
+        return (w, w2, squares + jnp.sum(grouped**2 / rays[:, None], axis=0), by_sum), None
 
     zero = jnp.zeros((SUMS if sums else 0, width), dtype)
     none = jnp.zeros(width, dtype)
-    chunks = (jnp.sum(back) + size - 1) // size
-    w, w2, squares, by_sum = jax.lax.fori_loop(0, chunks, part, (none, none, none, zero))
-    return w, w2, squares, jnp.sum(each > 0).astype(dtype), by_sum
+    return jax.lax.scan(part, (none, none, none, zero), (chunks, each))[0]
 
 
 @_sum_weights.defjvp
 def _(primals, tangents):
     # The derivative of a weight is the weight times the sums along its path: their means serve
     # every parameter at once.
-    *found, mean_sums = _moments(*primals, sums=True)
-    slope = jnp.sum(mean_sums * tangents[0].asked, axis=0).astype(found[0].dtype)
-    return tuple(found), (slope, *(jnp.zeros_like(part) for part in found[1:]))
+    weight, weight2, squares, mean_sums = _moments(*primals, sums=True)
+    slope = jnp.sum(mean_sums * tangents[0].asked, axis=0)
+    none = jnp.zeros_like(weight2)
+    return (weight, weight2, squares), (slope.astype(weight.dtype), none, none)
 
 
 @partial(jax.jit, static_argnames=("own_only",))
@@ -232,13 +225,13 @@ def collect(
     """
     weigher = _weigher(walked, asked, absorb, shares, own_only)
     rays, columns = paths.hero.shape[0], walked.mu_a.shape[1]
-    sent = rays if sent is None else sent
-    total = jnp.asarray(sent, weigher.asked.dtype)
+    sent = jnp.asarray(rays if sent is None else sent, jnp.int32)
+    total = sent.astype(weigher.asked.dtype)
     if not own_only:
-        *found, groups = _sum_weights(weigher, paths, jnp.asarray(sent, jnp.int32))
-        return Tally(total, groups, *found)
+        groups = jnp.ceil(total / _group(rays))
+        return Tally(total, groups, *_sum_weights(weigher, paths, sent))
     # each column has its share of the rays: only the scatter about its own mean is error
-    out = (jnp.arange(rays) < sent).astype(total.dtype)
+    out = (jnp.arange(rays, dtype=jnp.int32) < sent).astype(total.dtype)
     count = jnp.bincount(paths.hero, out, length=columns)
     weight, weight2 = _sum_own_weights(weigher, paths, columns)
     still = jax.lax.stop_gradient(weight) ** 2

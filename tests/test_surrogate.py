@@ -51,7 +51,7 @@ def test_outside_the_range_is_an_error_with_names_and_ranges(surrogate):
         surrogate(vector(surrogate, water=0.2))
     with pytest.raises(HyliosError, match="melanosome_form"):
         surrogate(vector(surrogate, melanosome_form="compact"))
-    with pytest.raises(HyliosError, match="expected 35 parameters"):
+    with pytest.raises(HyliosError, match="expected 36 parameters"):
         surrogate(jnp.zeros(3))
     with pytest.raises(HyliosError, match="was not trained on roughness"):
         surrogate.of(Specimen().replace(roughness=0.2), [500.0])
@@ -484,7 +484,7 @@ def finer_of(table, form, asked=None, seed=0, bar=None):
 
 
 def test_a_finer_order_and_slopes_are_learned_beyond_the_table(tmp_path, quick):
-    filled(tmp_path / "table.zarr")
+    filled(tmp_path / "table.zarr", 512)
     rows = table.read_table(tmp_path / "table.zarr")
     box = names, _, _ = training.box_of(rows)
     true = slopes_of(names, "dispersed", training.fresh(*box, 64, jax.random.key(5)))
