@@ -16,9 +16,8 @@ from hylios_fit.statevector import state_vector
 from hylios_fit.surrogate import Surrogate, load_surrogate
 
 EACH = 500  # specimens of each form and kind
-KINDS = ("usual", "every", "bare")
+KINDS = {"usual": 1, "every": 2, "bare": 5}  # and how many times fewer specimens
 BARE = ("melanosome_granulosum", "melanosome_spinosum")
-BARE_SHARE = 5  # so many times fewer of the last kind
 SLOPES = 24  # of each form whose derivatives are compared
 MODULES = ("training", "table", "skin", "adding", "streams", "statevector")
 GOALS = {"rms": 5e-4, "most": 3e-3, "ciede2000_q99": 0.1, "slopes": 0.01}
@@ -45,13 +44,13 @@ def run(
     }
     names = surrogate.at(surrogate.forms[0]).names
     folder = _shared.checkpoint("surrogate_error", MODULES, seed=seed, names=names)
-    for number, kind in enumerate(KINDS):
+    for number, (kind, fewer) in enumerate(KINDS.items()):
         parts = {}
         for form in surrogate.forms:
             member = surrogate.at(form)
             key = jax.random.fold_in(jax.random.key(seed), 100 + number)
             free = member.names if kind == "every" else ("usual",)
-            count = each // BARE_SHARE if kind == "bare" else each
+            count = each // fewer
             rows = training.fresh(member.names, member.lower, member.upper, count, key, free)
             if kind == "bare":
                 rows[:, [member.names.index(name) for name in BARE]] = 0.0

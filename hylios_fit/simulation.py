@@ -13,7 +13,7 @@ import numpy as np
 from hylios_fit import adding, analog, fresnel, skin, tally, walker
 from hylios_fit.errors import HyliosError
 from hylios_fit.skin import Specimen
-from hylios_fit.threads import cores, side_by_side
+from hylios_fit.threads import side_by_side
 from hylios_fit.units import WAVELENGTH_MAX, WAVELENGTH_MIN
 
 METHODS = ("walker", "analog", "adding", "surrogate")
@@ -162,8 +162,10 @@ def _walked(
             if tolerance is not None:
                 more = min(more, MOST_RAYS - sent)
             each = batch
-            if tolerance is not None:  # as many lots as keep all cores busy to the end
-                many = math.ceil(more / batch / cores()) * cores()
+            if tolerance is not None:
+                # an even number, so that two cores end together; not that of this machine's cores,
+                # or the same key would give other paths elsewhere
+                many = 2 * math.ceil(more / batch / 2)
                 each = math.ceil(more / many / GRAIN) * GRAIN
             lots = [(i, min(each, sent + more - i)) for i in range(sent, sent + more, each)]
             for found in side_by_side(lot, lots):
