@@ -104,6 +104,13 @@ def surrogate_record(surrogate: Any) -> dict[str, Any]:
     }
 
 
+def on_cpu() -> bool:
+    """Whether JAX runs on the CPU, where the processor's time is what work costs."""
+    import jax
+
+    return jax.default_backend() == "cpu"
+
+
 def band_masks(wavelength_nm: np.ndarray) -> dict[str, np.ndarray]:
     """Which bands lie in each range of `BANDS_NM`, for the ranges that have any."""
     nm = np.asarray(wavelength_nm, float)

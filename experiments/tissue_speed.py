@@ -54,7 +54,7 @@ def run(seed: int = 0, repeats: int = REPEATS, thinner: int = 1) -> dict[str, An
     return {
         "c_compiler": "none found: the C programs were left out" if program is None else _version(),
         "c_flags": "-O3 -march=native",
-        "timed_by": "CPU seconds" if _on_cpu() else "seconds",
+        "timed_by": "CPU seconds" if _shared.on_cpu() else "seconds",
         "repeats": repeats,
         "cases": cases,
         "changes": _changes(key, max(repeats // 2, 1), thinner),
@@ -171,13 +171,9 @@ def _replaced(name: str, by: Any) -> Iterator[None]:
         yield
 
 
-def _on_cpu() -> bool:
-    return jax.default_backend() == "cpu"
-
-
 def _timed(work: Callable[[], Totals]) -> tuple[float, Totals]:
     """Seconds of all threads, which is a core's time however many there are, and the result."""
-    clock = time.process_time if _on_cpu() else time.perf_counter
+    clock = time.process_time if _shared.on_cpu() else time.perf_counter
     start = clock()
     found = work()
     return clock() - start, found

@@ -53,7 +53,7 @@ def run(
         "goal_core_seconds": {k: v for k, v in GOAL_S.items() if k in found},
         "repeats": repeats,
         "cores": cores(),
-        "timed_by": "CPU seconds" if _on_cpu() else "seconds",
+        "timed_by": "CPU seconds" if _shared.on_cpu() else "seconds",
         "pigments": list(PIGMENTS),
         "specimens": found,
         "peak_memory_mib": {str(rays): _peak_memory(rays, len(nm)) for rays in memory_rays},
@@ -112,17 +112,13 @@ def _curves(
     return [_cost(lambda k=key: simulate(specimen, nm, tolerance=tolerance, key=k)) for key in keys]
 
 
-def _on_cpu() -> bool:
-    return jax.default_backend() == "cpu"
-
-
 def _cost(call: Callable[[], Any]) -> tuple[tuple[float, float], Any]:
     """(processor seconds of all threads, wall seconds), and what was made; on an accelerator both
     are wall seconds."""
     wall, busy = time.perf_counter(), time.process_time()
     made = jax.block_until_ready(call())
     seconds = time.perf_counter() - wall
-    return (time.process_time() - busy if _on_cpu() else seconds, seconds), made
+    return (time.process_time() - busy if _shared.on_cpu() else seconds, seconds), made
 
 
 def _median(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:

@@ -159,18 +159,17 @@ def _walked(
     more = math.ceil(rays / batch) * batch if tolerance is None else FIRST * walker.BATCH
     with progress_bar(rays if tolerance is None else None, progress) as bar:
         while more:
-            if tolerance is not None:
-                more = min(more, MOST_RAYS - sent)
             each = batch
             if tolerance is not None:
+                more = min(more, MOST_RAYS - sent)
                 # an even number, so that two cores end together; not that of this machine's cores,
                 # or the same key would give other paths elsewhere
                 many = 2 * math.ceil(more / batch / 2)
                 each = math.ceil(more / many / GRAIN) * GRAIN
             lots = [(i, min(each, sent + more - i)) for i in range(sent, sent + more, each)]
-            for found in side_by_side(lot, lots):
+            for (_, some), found in zip(lots, side_by_side(lot, lots), strict=True):
                 total = tally.add(total, found)
-            bar.update(more)
+                bar.update(some)
             sent += more
             assert total is not None
             error = (1.0 - surface) * np.asarray(total.standard_error, float)
