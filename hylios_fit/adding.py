@@ -30,6 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
+from numpy.polynomial import Chebyshev, Polynomial
 
 from hylios_fit import streams
 from hylios_fit.errors import HyliosError
@@ -43,7 +44,7 @@ ORDER = 8
 """Streams for light that can leave; others in proportion. Its error on S1 to S4 is below 1e-4."""
 ORDERS = (6, 8, 12, 16, 24, 32)
 START = 2.0  # x that the Pade form of tanh(x)/x starts from
-DOUBLINGS = 24  # at most; as many are done as the thickest layer of a block needs
+DOUBLINGS = 40  # at most; as many are done as the thickest layer of a block needs
 OPAQUE = 1e5  # optical thickness that stands for an infinite one
 
 
@@ -92,41 +93,199 @@ def _transposed(matrix: Array) -> Array:
     return jnp.swapaxes(matrix, -1, -2)
 
 
+# On a CPU a product of two of these matrices takes a twentieth of the time of LAPACK's solution:
+# whatever can be is worked out by products, the rest by an elimination over many at once.
+
+
+@lru_cache(maxsize=8)
+def _series(name: str, dtype: str) -> tuple[int, tuple[float, ...]]:
+    """(b, coefficients) of a polynomial in v = -1 to 1, to be summed up in blocks of b powers."""
+    function, high = _FUNCTIONS[name]
+    block, degree = _DEGREES[name, dtype]
+    told = Chebyshev.interpolate(function, degree, (0.0, high))
+    return block, tuple(told.convert(kind=Polynomial, domain=(0.0, high)).coef.tolist())
+
+
+def _tanh_over(x2: np.ndarray) -> np.ndarray:
+    x = np.sqrt(np.maximum(x2, 1e-30))
+    return np.tanh(x) / x
+
+
+_FUNCTIONS = {"tanh": (_tanh_over, START**2), "inverse": (lambda x: 1.0 / (1.0 + x), 1.0)}
+# the error falls by 4.2 and 5.8 a degree
+_DEGREES = {
+    ("tanh", "float32"): (4, 12), ("tanh", "float64"): (5, 25),
+    ("inverse", "float32"): (3, 9), ("inverse", "float64"): (5, 20),
+}  # fmt: skip
+
+
+def _sum_up(name: str, x: Array) -> Array:
+    """A function of matrices, of which all eigenvalues lie where its series holds: products only
+    (Paterson and Stockmeyer 1973)."""
+    high = _FUNCTIONS[name][1]
+    block, factors = _series(name, x.dtype.name)
+    unit = jnp.eye(x.shape[-1], dtype=x.dtype)[None]
+    powers = [unit, (2.0 / high) * x - unit]
+    while len(powers) <= block:
+        powers.append(powers[-1] @ powers[1])
+
+    def part(first: int, last: int) -> Array:
+        return sum((factors[i] * powers[i - first] for i in range(first, last)), jnp.zeros_like(x))
+
+    top = (len(factors) - 2) // block * block
+    found = part(top, len(factors))
+    for first in reversed(range(0, top, block)):
+        found = found @ powers[block] + part(first, first + block)
+    return found
+
+
+def _by_its_inverse(function):
+    """With the derivative of an inverse: that of the way to it would cost more."""
+    function = jax.custom_jvp(function, nondiff_argnums=())
+
+    @function.defjvp
+    def _(primals, tangents):
+        inverse = function(*primals)
+        return inverse, -(inverse @ tangents[0] @ inverse)
+
+    return function
+
+
+@_by_its_inverse
+def _inverse_above_one(x: Array) -> Array:
+    """(1 + x)^-1 for eigenvalues of x from 0 to 1."""
+    return _sum_up("inverse", x)
+
+
+@_by_its_inverse
+def _inverse(a: Array) -> Array:
+    """By Gauss and Jordan, without pivots: what is inverted here is 1 plus a positive matrix, or 1
+    minus what a passive medium sends back."""
+    m = jnp.moveaxis(a, 0, -1)  # many at once
+    place = jnp.arange(m.shape[0])[:, None]
+
+    def step(k: Array, m: Array) -> Array:
+        here = place == k
+        row = m[k]
+        row = jnp.where(here, 1.0, row) * (1.0 / jax.lax.dynamic_index_in_dim(row, k, 0))
+        rest = jnp.where(here[None], 0.0, m) - m[:, k][:, None] * row[None]
+        return jnp.where(here[:, None], row[None], rest)
+
+    return jnp.moveaxis(jax.lax.fori_loop(0, m.shape[0], step, m), -1, 0)
+
+
+class _Rates(NamedTuple):
+    """E and O of a layer, by half of its thickness, and what they change by for the scattering
+    coefficient; `thin` is half of the thickness that the series of tanh is for, and `doublings`
+    lead from there to the whole."""
+
+    even: Float[Array, "w s s"]
+    odd: Float[Array, "w s s"]
+    even_by_scattering: Float[Array, "w s s"]
+    odd_by_scattering: Float[Array, "w s s"]
+    thin: Float[Array, "w 1 1"]
+    doublings: Float[Array, ""]
+
+
+def _rates(extinction, scattering, half, even, odd, cosine, chi) -> _Rates:
+    s = cosine.shape[-1]
+    root = jax.lax.rsqrt(cosine)
+    frame = root[:, :, None] * root[:, None, :]
+    straight = frame * extinction[:, None, None] * jnp.eye(s, dtype=half.dtype)[None]
+    kernels = [
+        -frame * ((basis * moments[:, None, :s]) @ _transposed(basis))
+        for basis, moments in ((even, chi[:, 0::2]), (odd, chi[:, 1::2]))
+    ]
+    rates = [straight + scattering[:, None, None] * kernel for kernel in kernels]
+    # no eigenvalue is larger
+    least = jnp.maximum(-jnp.min(chi, axis=1), 0.0)
+    largest = (extinction + scattering * least) / jnp.min(cosine, axis=1)
+    largest, deepest = jax.lax.stop_gradient((largest, jnp.max(largest * half)))
+    doublings = jnp.ceil(jnp.log2(jnp.maximum(deepest, START) / START))
+    doublings = jnp.minimum(doublings, DOUBLINGS)
+    thin = jnp.minimum(half * jnp.exp2(-doublings), START / jnp.maximum(largest, 1e-30))
+    return _Rates(*rates, *kernels, thin[:, None, None], doublings)
+
+
 def _slab(extinction, scattering, half, even, odd, cosine, chi):
     """(R, T) of a layer that scatters; all with a leading axis of wavelengths."""
-    s = cosine.shape[-1]
-    unit = jnp.eye(s, dtype=half.dtype)[None]
-    root = jax.lax.rsqrt(cosine)
-    steepest = jnp.max(extinction * half / jnp.min(cosine, axis=1))
-    doublings = jnp.ceil(jnp.log2(jnp.maximum(jax.lax.stop_gradient(steepest), START) / START))
-    doublings = jnp.minimum(doublings, DOUBLINGS)
-    frame = (half * jnp.exp2(-doublings))[:, None, None] * root[:, :, None] * root[:, None, :]
+    rates = _rates(extinction, scattering, half, even, odd, cosine, chi)
+    e, o = rates.thin * rates.even, rates.thin * rates.odd
+    t = _sum_up("tanh", o @ e)
 
-    def rate(basis, moments):
-        kernel = (basis * moments[:, None, :s]) @ _transposed(basis)
-        return frame * (extinction[:, None, None] * unit - scattering[:, None, None] * kernel)
-
-    e, o = rate(even, chi[:, 0::2]), rate(odd, chi[:, 1::2])
-    x2 = o @ e
-    x4 = x2 @ x2
-    t = jnp.linalg.solve(945.0 * unit + 420.0 * x2 + 15.0 * x4, 945.0 * unit + 105.0 * x2 + x4)
-    y, z = e @ t, t @ o
-
-    def double(pair):
+    def double(pair):  # 2 Y (1 + Z Y)^-1, and 2 (1 + Z Y)^-1 Z
         y, z = pair
-        # 1 + Z Y is not symmetric, Y and Z are: Y (1 + Z Y)^-1 = (1 + Y Z)^-1 Y
-        both = jnp.linalg.solve(jnp.stack([unit + y @ z, unit + z @ y]), jnp.stack([y, z]))
-        return 2.0 * both[0], 2.0 * both[1]
+        shared = 2.0 * _inverse_above_one(z @ y)
+        return y @ shared, shared @ z
 
     def step(pair, number):  # a loop of its own length would have no reverse derivative
-        return jax.lax.cond(number < doublings, double, lambda same: same, pair), None
+        return jax.lax.cond(number < rates.doublings, double, lambda same: same, pair), None
 
     numbers = jnp.arange(DOUBLINGS, dtype=half.dtype)
-    y, z = jax.lax.scan(step, (y, z), numbers)[0]
-    whole, odd_part = jnp.linalg.solve(
-        jnp.stack([unit + y, unit + z]), jnp.stack([unit - y, z - unit])
+    y, z = jax.lax.scan(step, (e @ t, t @ o), numbers)[0]
+    # R + T = 2 (1 + Y)^-1 - 1, R - T = 1 - 2 (1 + Z)^-1
+    unit = jnp.eye(cosine.shape[-1], dtype=half.dtype)[None]
+    both, apart = _inverse(unit + y), _inverse(unit + z)
+    return both - apart, both + apart - unit
+
+
+@jax.custom_jvp
+def _layer(extinction, scattering, half, even, odd, cosine, chi):
+    """As `_slab`, with derivatives by the first three alone. They are worked out on the way down:
+    to remember every doubling for a way back costs several times as much."""
+    return _slab(extinction, scattering, half, even, odd, cosine, chi)
+
+
+@_layer.defjvp
+def _(primals, tangents):
+    extinction, scattering, half, _, _, cosine, _ = primals
+    rates = _rates(*primals)
+    e, o = rates.thin * rates.even, rates.thin * rates.odd
+    unit = jnp.eye(cosine.shape[-1], dtype=half.dtype)[None]
+    straight = rates.thin * unit / cosine[:, None, :]
+    ways = (  # by extinction, by scattering
+        (straight, straight),
+        (rates.thin * rates.even_by_scattering, rates.thin * rates.odd_by_scattering),
     )
-    return 0.5 * (whole + odd_part), 0.5 * (whole - odd_part)
+    t, turn = jax.linearize(partial(_sum_up, "tanh"), o @ e)
+    started = []
+    for de, do in ways:
+        dt = turn(do @ e + o @ de)
+        started.append((de @ t + e @ dt, dt @ o + t @ do))
+
+    def double(_, matrices):  # all but m are symmetric
+        y, z, changes = matrices
+        m = _inverse_above_one(z @ y)
+        turned, p, q = _transposed(m), y @ m, m @ z
+        changes = [
+            (2.0 * (turned @ dy @ m - p @ dz @ p), 2.0 * (m @ dz @ turned - q @ dy @ q))
+            for dy, dz in changes
+        ]
+        return 2.0 * p, 2.0 * q, changes
+
+    doublings = rates.doublings.astype(jnp.int32)
+    y, z, changes = jax.lax.fori_loop(0, doublings, double, (e @ t, t @ o, started))
+    both, apart = _inverse(unit + y), _inverse(unit + z)
+    by = []
+    for dy, dz in changes:
+        dboth, dapart = both @ dy @ both, apart @ dz @ apart
+        by.append((dapart - dboth, -dapart - dboth))
+    # only half the thickness times a coefficient matters
+    share = 1.0 / jnp.where(half > 0, half, 1.0)
+    none = rates.odd - rates.even, -rates.even - rates.odd
+    by_half = [
+        jnp.where(
+            (half > 0)[:, None, None],
+            (share * extinction)[:, None, None] * more + (share * scattering)[:, None, None] * less,
+            at_once,
+        )
+        for more, less, at_once in zip(*by, none, strict=True)
+    ]
+    moved = [
+        sum(change[:, None, None] * one for change, one in zip(tangents[:3], each, strict=True))
+        for each in zip(*by, by_half, strict=True)
+    ]
+    return (both - apart, both + apart - unit), tuple(moved)
 
 
 def _mean_decay(x: Array) -> Array:
@@ -149,6 +308,29 @@ def _fibres(absorption, fibre, thickness, even, cosine):
     straight = jnp.eye(s, dtype=cosine.dtype)[None] * jnp.exp(-before)
     on = jnp.exp(-jnp.minimum(before, after)) * _mean_decay(jnp.abs(before - after))
     return rate * _mean_decay(before + after), straight + rate * on
+
+
+def _first_hits(extinction, scattering, thickness, even, odd, cosine, chi, below):
+    """What first scattering in a clear layer adds to what it and all `below` reflect.
+
+    All that the derivative by its scattering needs, where that is none: the value is 0 there.
+    """
+    s = cosine.shape[-1]
+    root = jax.lax.rsqrt(cosine)
+    sum_, difference = (
+        (basis * moments[:, None, :s]) @ _transposed(basis)
+        for basis, moments in ((even, chi[:, 0::2]), (odd, chi[:, 1::2]))
+    )
+    frame = 0.5 * thickness[:, None, None] * root[:, :, None] * root[:, None, :]
+    depth = extinction[:, None] * thickness[:, None] / cosine
+    into, out = depth[:, None, :], depth[:, :, None]
+    fade = jnp.exp(-depth)
+    back = frame * (sum_ - difference) * _mean_decay(into + out)
+    on = frame * (sum_ + difference) * jnp.exp(-jnp.minimum(into, out))
+    on = on * _mean_decay(jnp.abs(into - out))
+    arrives, leaves = below * fade[:, None, :], fade[:, :, None] * below
+    adds = back + on @ arrives + leaves @ on + leaves @ back @ arrives
+    return scattering[:, None, None] * jax.lax.stop_gradient(adds)
 
 
 # wavelengths at a time: what they need stays in the cache, and memory is bounded
@@ -219,36 +401,45 @@ def _solve_block(
             pass_ = 1.0 - r[:, :common]
             closed = unit(counts[i + 1]) - below * under[:, None, :]
             down["interface", i] = (below, under, pass_)
-            inside = jnp.linalg.solve(closed, below)[:, :common, :common]
+            inside = (_inverse(closed) @ below)[:, :common, :common]
             above = jnp.zeros((which.size, s, s), dtype)
             above = above.at[:, :common, :common].set(
                 pass_[:, :, None] * inside * pass_[:, None, :]
             )
             below = above + over[:, :, None] * unit(s)
         mu = optics.cosine[i][which]
-        if kinds[i] == "clear":
+        even, odd, chi = optics.even[i], optics.odd[i], c.moments[i]
+        if kinds[i] in ("clear", "bare"):
             fade = jnp.exp(-c.extinction[i][:, None] * c.thickness[i][:, None] / mu)
             down["layer", i] = (below, None, fade)
-            below = fade[:, :, None] * below * fade[:, None, :]
+            above = fade[:, :, None] * below * fade[:, None, :]
+            if kinds[i] == "bare":
+                assert even is not None
+                assert odd is not None
+                assert chi is not None
+                above = above + _first_hits(
+                    c.extinction[i], c.scattering[i], c.thickness[i], even[which], odd[which],
+                    mu, chi, below,
+                )  # fmt: skip
+            below = above
             continue
-        even = optics.even[i]
         assert even is not None
         if kinds[i] == "fibres":
             r, t = _fibres(c.extinction[i], c.once[i], c.thickness[i], even[which], mu)
         else:
-            odd, chi = optics.odd[i], c.moments[i]
             assert odd is not None
             assert chi is not None
-            r, t = _slab(
+            slab = _layer if kinds[i] == "scatter" else _slab
+            r, t = slab(
                 c.extinction[i], c.scattering[i], 0.5 * c.thickness[i], even[which], odd[which],
                 mu, chi,
             )  # fmt: skip
         down["layer", i] = (below, r, t)
-        below = r + t @ jnp.linalg.solve(unit(s) - below @ r, below @ t)
+        below = r + t @ _inverse(unit(s) - below @ r) @ below @ t
     s = counts[0]
     source = optics.enters[which] / root[:, :s]
     back = optics.back[which] * root[:, None, :s] / root[:, :s, None]
-    light = jnp.linalg.solve(unit(s) - back @ below, source[:, :, None])
+    light = _inverse(unit(s) - back @ below) @ source[:, :, None]
     up = (below @ light)[:, :, 0]
     out = jnp.sum(optics.leaves[which] * root[:, :s] * up, axis=1)
     if not inner:
@@ -265,7 +456,7 @@ def _solve_block(
         if r is None:
             d = t * d
         else:  # d = t d + r u, u = below d
-            d = jnp.linalg.solve(unit(d.shape[1]) - r @ below, t @ d[:, :, None])[:, :, 0]
+            d = (_inverse(unit(d.shape[1]) - r @ below) @ t @ d[:, :, None])[:, :, 0]
         u = (below @ d[:, :, None])[:, :, 0]
         leaves = net(d, u)
         absorbed.append(arrives - leaves)
@@ -277,7 +468,7 @@ def _solve_block(
             start = start.at[:, :common].set(pass_ * d[:, :common])
             # d = start + under * u, u = below d
             over_ = unit(counts[i + 1]) - under[:, :, None] * below
-            d = jnp.linalg.solve(over_, start[:, :, None])[:, :, 0]
+            d = (_inverse(over_) @ start[:, :, None])[:, :, 0]
     return out, jnp.stack(absorbed), arrives
 
 
@@ -307,7 +498,7 @@ def _optics(
     layers = range(len(kinds))
     bases = [
         [streams.scattering_basis(st, row[i]) for st, row in zip(sets, indices, strict=True)]
-        if kinds[i] in ("scatter", "fibres") else None
+        if kinds[i] != "clear" else None
         for i in layers
     ]  # fmt: skip
 
@@ -448,8 +639,8 @@ def _of_skin(
 ):
     """(coefficients, kind of each layer, indices, roughness).
 
-    A layer that scatters nothing is solved as clear, unless one of the parameters that are `moving`
-    would make it scatter.
+    A layer that scatters nothing is clear, or "bare" where one of the parameters that are `moving`
+    would make it scatter: then its first scattering is what has to be known.
     """
     w = layers.mu_a.shape[1]
     index, roughness = (
@@ -458,12 +649,16 @@ def _of_skin(
     )
     kinds = ["clear"] * 6
     for i in (1, 2, 3):
-        if _present(layers.mu_particle[i]) or f"melanosome_{LAYERS[i]}" in moving:
+        if _present(layers.mu_particle[i]):
             kinds[i] = "scatter"
+        elif f"melanosome_{LAYERS[i]}" in moving:
+            kinds[i] = "bare"
     if _present(layers.mu_fibre) or {"fibre_fraction", "fibre_radius"} & {*moving}:
         kinds[4] = "fibres"
-    if _present(layers.mu_tissue[5]) or "reticular_scattering" in moving:
+    if _present(layers.mu_tissue[5]):
         kinds[5] = "scatter"
+    elif "reticular_scattering" in moving:
+        kinds[5] = "bare"
     theta_0 = _concrete("theta_0", layers.theta_0)
     angles, place = np.unique(theta_0, return_inverse=True)
     top = Streams.make((1.0, *index[:, 0]), order, parts).weight.size
@@ -579,7 +774,7 @@ def tissue(
     index = _concrete("the indices", layers.index)
     above, below = (float(_concrete("the indices", n)) for n in (layers.above, layers.below))
     m = index.size
-    kinds = tuple("scatter" if _present(layers.mu_s[i]) else "clear" for i in range(m))
+    kinds = tuple("tissue" if _present(layers.mu_s[i]) else "clear" for i in range(m))
     every = np.concatenate([index, [below]])
     top = Streams.make((above, *every), order).weight.size
     with _precision(dtype):

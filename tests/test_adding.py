@@ -1,6 +1,8 @@
 """The deterministic solver: published values, laws, limits, derivatives, and the walks."""
 
+import itertools
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -183,6 +185,81 @@ def test_slopes_are_those_of_finite_differences(x64):
         x = specimen.values[name]
         up, down = (curve(specimen.replace(**{name: x * (1 + sign * 1e-4)})) for sign in (1, -1))
         np.testing.assert_allclose(slope, (up - down) / (2e-4 * x), rtol=1e-5, atol=1e-9)
+
+
+def layer_of(extinction, albedo, depth, order=8):
+    """What a layer of skin is solved from, for optical depths of half of it."""
+    st = streams.Streams.make((1.0, 1.4), order)
+    even, odd = (jnp.asarray(basis)[None] for basis in streams.scattering_basis(st, 1.4))
+    cosine = jnp.asarray(st.cosine(1.4))[None]
+    chi = jnp.asarray(streams.exponential_moments((0.6,), 2 * st.weight.size))
+    extinction = jnp.array([float(extinction)])
+    half = depth / jnp.maximum(extinction, 1.0)
+    return (extinction, albedo * extinction, half), (even, odd, cosine, chi)
+
+
+def mixed(solver, numbers, rest):
+    """Some sum of all that a layer reflects and transmits."""
+    weights = np.random.default_rng(0).normal(size=(2, *rest[0].shape))
+    return sum(jnp.sum(w * m) for w, m in zip(weights, solver(*numbers, *rest), strict=True))
+
+
+def test_a_layer_keeps_its_light_and_knows_its_derivatives(x64):
+    own, generic = (jax.jit(jax.grad(partial(mixed, f))) for f in (adding._layer, adding._slab))
+    root = np.sqrt(streams.Streams.make((1.0, 1.4), 8).weight)
+    for albedo, depth in itertools.product((0.0, 0.6, 1.0), (0.0, 1e-6, 0.03, 2.0, 500.0)):
+        numbers, rest = layer_of(30.0, albedo, depth)
+        for mine, expected in zip(own(numbers, rest), generic(numbers, rest), strict=True):
+            assert float(mine[0]) == pytest.approx(float(expected[0]), rel=1e-8, abs=1e-9)
+        r, t = adding._layer(*numbers, *rest)
+        for part, same in zip((r, t), adding._slab(*numbers, *rest), strict=True):
+            np.testing.assert_array_equal(np.asarray(part), np.asarray(same))
+        flux = root @ np.asarray(r + t)[0]  # for light of every stream, once each
+        if albedo == 1.0:
+            np.testing.assert_allclose(flux, root, rtol=1e-9)
+        elif depth:
+            assert np.all(flux < root)
+
+
+def test_a_layer_of_any_thickness_is_opaque_at_most(x64):
+    (extinction, scattering, _), rest = layer_of(30.0, 0.6, 1.0)
+    thick, thicker = (
+        adding._layer(extinction, scattering, jnp.array([half]), *rest) for half in (1e3, 1e30)
+    )
+    np.testing.assert_allclose(np.asarray(thick[0]), np.asarray(thicker[0]), atol=1e-12)
+    np.testing.assert_allclose(np.asarray(thicker[1]), 0.0, atol=1e-12)
+
+
+def test_a_layer_of_nothing_has_the_derivative_of_a_little(x64):
+    _, rest = layer_of(1.0, 0.0, 0.0)
+    numbers = jnp.zeros(1), jnp.zeros(1), jnp.array([0.2])
+    change = jax.grad(partial(mixed, adding._layer))((*numbers,), rest)
+    step = 1e-8  # the flattest stream goes a long way through it
+    for i in range(2):
+        more = [*numbers]
+        more[i] = numbers[i] + step
+        little = mixed(adding._layer, more, rest) - mixed(adding._layer, numbers, rest)
+        assert float(change[i][0]) == pytest.approx(float(little) / step, rel=1e-4)
+
+
+@pytest.mark.parametrize(("dtype", "within"), [(np.float64, 1e-13), (np.float32, 3e-6)])
+def test_inverses_are_inverses(x64, dtype, within):
+    generator = np.random.default_rng(1)
+    turn = np.linalg.qr(generator.normal(size=(5, 23, 23)))[0]
+    positive = np.einsum("nij,nj,nkj->nik", turn, generator.uniform(0, 1, (5, 23)), turn)
+    exact = np.linalg.inv(positive + np.eye(23))
+    by_series = adding._inverse_above_one(jnp.asarray(positive, dtype))
+    by_steps = adding._inverse(jnp.asarray(positive + np.eye(23), dtype))
+    assert by_series.dtype == by_steps.dtype == dtype
+    for found in (by_series, by_steps):
+        np.testing.assert_allclose(np.asarray(found), exact, atol=within)
+    change = generator.normal(size=positive.shape)
+    for function, at in (
+        (adding._inverse_above_one, positive),
+        (adding._inverse, positive + np.eye(23)),
+    ):
+        _, slope = jax.jvp(function, (jnp.asarray(at, dtype),), (jnp.asarray(change, dtype),))
+        np.testing.assert_allclose(np.asarray(slope), -exact @ change @ exact, atol=50 * within)
 
 
 def test_slopes_say_what_they_cannot():
