@@ -75,6 +75,7 @@ COMPONENTS = 80
 HIDDEN = (192, 128, 128)
 STEPS = 120_000
 BATCH = 1024
+SEEN, EMPHASIS = (380.0, 720.0), 2.0  # nm; errors count so much more where the eye sees them
 CORNERS = 0.25  # what a specimen from all over the box weighs: the hardest, and few fits are there
 LEAST_ROWS = 64  # of each form
 CHECK_ORDER = 8  # of the solver that they are held against
@@ -436,11 +437,13 @@ def learn_locally(
     x = _examples(axes, form, rows)
     centre, scale = x.mean(axis=0), x.std(axis=0) + np.float32(1e-6)
     middle, unit = float(log.mean()), float(log.std())
-    weight, variance = None, float(noise.mean()) / unit**2
+    seen = emphasis(table["wavelength_nm"].values) ** 2
+    weight, variance = np.ones_like(log), float(noise.mean()) / unit**2
     if table.attrs["generator"] == "walker":  # the errors of `adding` are no noise
-        weight = (1.0 / (noise + TRUST**2)).reshape(-1)
+        weight = 1.0 / (noise + TRUST**2)
         variance = ALIKE / float(weight.mean()) / unit**2
         weight /= weight.mean()
+    weight = (weight * seen / seen.mean()).reshape(-1)
     x, y, along = (x - centre) / scale, log.reshape(-1, 1), None
     if finer is not None:
         y = y + _order(finer, form, centre, scale, seed)(x)
@@ -455,6 +458,8 @@ def learn_locally(
         dx, dy = (np.pad(change, ((len(x), 0), (0, 0))) for change in changes)
         along = dx / scale, dy / unit
         x, y = np.concatenate([x, (inputs - centre) / scale]), np.concatenate([y, logs])
+        more = np.resize(seen / seen.mean(), len(logs))  # wavelength after wavelength
+        weight = np.concatenate([weight, more])
     y = (y - middle) / unit
     network = Perceptron(
         LOCAL_HIDDEN, steps or LOCAL_STEPS, LOCAL_BATCH, variance=variance, seed=seed, bar=bar
@@ -557,7 +562,8 @@ def _fits(
             local = learn_locally(table, form, seed, bar, finer=finer)
             x, log, along = answers(local, names, asked, seed)
             network = Perceptron(HIDDEN, STEPS, BATCH, seed=seed, bar=bar)
-            return fit(x, log, network, along, importance(len(asked)))
+            seen = emphasis(table["wavelength_nm"].values)
+            return fit(x, log, network, along, importance(len(asked)), seen)
 
         return dict(zip(forms, pool.map(one, forms), strict=True))
 
@@ -619,6 +625,12 @@ def importance(count: int) -> np.ndarray:
     return np.where(np.arange(count) < count // 10, CORNERS, 1.0)
 
 
+def emphasis(wavelength_nm: np.ndarray) -> np.ndarray:
+    """What errors are multiplied by, (w,): a colour needs more of few wavelengths than a fit."""
+    low, high = SEEN
+    return np.where((wavelength_nm >= low) & (wavelength_nm <= high), EMPHASIS, 1.0)
+
+
 def _prior(count: int) -> int:
     """Where among so many `specimens` those from the prior begin, the usual parameters free."""
     return 2 * (count // 10)
@@ -630,12 +642,13 @@ def fit(
     network: Any,
     along: tuple[np.ndarray, np.ndarray] | None = None,
     weight: np.ndarray | None = None,
+    scale: np.ndarray | float = 1.0,
 ) -> dict[str, np.ndarray]:
     """Standardise, reduce, regress: features (n, f), and what they give (n, w).
 
     The network is a `Perceptron`, or another with `coefs_` and `intercepts_`, not fitted yet;
-    `along`, which only the first takes, are the changes of both along one direction at each, and
-    `weight` what each counts.
+    `along`, which only the first takes, are the changes of both along one direction at each,
+    `weight` what each counts, and `scale` (w,) what errors are multiplied by.
     Returns every number of what the surrogate evaluates, by name.
     """
     from sklearn.decomposition import PCA
@@ -643,7 +656,7 @@ def fit(
 
     scaler: Any = StandardScaler().fit(x)
     # in single precision the components beyond 3e-4 of the first were noise, and cost 4e-4
-    log = log.astype(float)
+    log = log.astype(float) * scale
     pca: Any = PCA(min(COMPONENTS, len(x) // 4), random_state=0).fit(log)
     scores = pca.transform(log)
     unit = scores[:, 0].std()  # one scale for all, so that what matters more weighs more
@@ -651,7 +664,7 @@ def fit(
     if weight is not None:
         more["sample_weight"] = weight
     if along is not None:
-        more["along"] = along[0] / scaler.scale_, along[1] @ pca.components_.T / unit
+        more["along"] = along[0] / scaler.scale_, (along[1] * scale) @ pca.components_.T / unit
     network.fit(scaler.transform(x), scores / unit, **more)
     weights, biases = (
         [*parts[:-1], parts[-1] * unit] for parts in (network.coefs_, network.intercepts_)
@@ -659,8 +672,8 @@ def fit(
     return {
         "centre": scaler.mean_,
         "scale": scaler.scale_,
-        "components": pca.components_,
-        "mean": pca.mean_,
+        "components": pca.components_ / scale,
+        "mean": pca.mean_ / scale,
         **{f"weight{i}": w for i, w in enumerate(weights)},
         **{f"bias{i}": b for i, b in enumerate(biases)},
     }
