@@ -12,9 +12,11 @@ goes down and up change (symmetric, positive), half a layer of the thickness h a
 
     Y = E h/2 t,    Z = t O h/2,    t = tanh(x)/x at x^2 = O E (h/2)^2,
 
-and reflects and transmits R + T = (1 + Y)^-1 (1 - Y), R - T = -(1 + Z)^-1 (1 - Z). A Pade form of
+and reflects and transmits R + T = (1 + Y)^-1 (1 - Y), R - T = -(1 + Z)^-1 (1 - Z). A polynomial for
 tanh(x)/x starts from a layer thin enough, 2 Y (1 + Z Y)^-1 doubles it, and no step has a limit in
-which it divides by nothing: no absorption, no scattering and opaque layers are ordinary cases.
+which it divides by nothing: no absorption, no scattering and opaque layers are ordinary cases. All
+eigenvalues of Z Y lie between 0 and 1, so that this inverse is a polynomial too: products of
+matrices, which a processor is good at, are nearly all that is done.
 """
 
 from __future__ import annotations
@@ -37,13 +39,12 @@ from hylios_fit.errors import HyliosError
 from hylios_fit.skin import LAYERS, Layers, Specimen, let_stand
 from hylios_fit.skin import layers as layers_of
 from hylios_fit.streams import SAME, Streams
-from hylios_fit.threads import one_blas_thread
 from hylios_fit.tissue import Tissue
 
 ORDER = 8
 """Streams for light that can leave; others in proportion. Its error on S1 to S4 is below 1e-4."""
 ORDERS = (6, 8, 12, 16, 24, 32)
-START = 2.0  # x that the Pade form of tanh(x)/x starts from
+START = 2.0  # x that the polynomial for tanh(x)/x holds to
 DOUBLINGS = 40  # at most; as many are done as the thickest layer of a block needs
 OPAQUE = 1e5  # optical thickness that stands for an infinite one
 
@@ -93,8 +94,7 @@ def _transposed(matrix: Array) -> Array:
     return jnp.swapaxes(matrix, -1, -2)
 
 
-# On a CPU a product of two of these matrices takes a twentieth of the time of LAPACK's solution:
-# whatever can be is worked out by products, the rest by an elimination over many at once.
+# On a CPU a product of two of these matrices takes a twentieth of the time of a solution by LAPACK.
 
 
 @lru_cache(maxsize=8)
@@ -139,9 +139,9 @@ def _sum_up(name: str, x: Array) -> Array:
     return found
 
 
-def _by_its_inverse(function):
+def _as_an_inverse(function):
     """With the derivative of an inverse: that of the way to it would cost more."""
-    function = jax.custom_jvp(function, nondiff_argnums=())
+    function = jax.custom_jvp(function)
 
     @function.defjvp
     def _(primals, tangents):
@@ -151,17 +151,17 @@ def _by_its_inverse(function):
     return function
 
 
-@_by_its_inverse
+@_as_an_inverse
 def _inverse_above_one(x: Array) -> Array:
     """(1 + x)^-1 for eigenvalues of x from 0 to 1."""
     return _sum_up("inverse", x)
 
 
-@_by_its_inverse
+@_as_an_inverse
 def _inverse(a: Array) -> Array:
-    """By Gauss and Jordan, without pivots: what is inverted here is 1 plus a positive matrix, or 1
-    minus what a passive medium sends back."""
-    m = jnp.moveaxis(a, 0, -1)  # many at once
+    """By Gauss and Jordan, for many matrices at once and without pivots: what is inverted here is 1
+    plus a positive matrix, or 1 minus what a passive medium sends back."""
+    m = jnp.moveaxis(a, 0, -1)
     place = jnp.arange(m.shape[0])[:, None]
 
     def step(k: Array, m: Array) -> Array:
@@ -196,15 +196,15 @@ def _rates(extinction, scattering, half, even, odd, cosine, chi) -> _Rates:
         -frame * ((basis * moments[:, None, :s]) @ _transposed(basis))
         for basis, moments in ((even, chi[:, 0::2]), (odd, chi[:, 1::2]))
     ]
-    rates = [straight + scattering[:, None, None] * kernel for kernel in kernels]
+    first, second = (straight + scattering[:, None, None] * kernel for kernel in kernels)
     # no eigenvalue is larger
     least = jnp.maximum(-jnp.min(chi, axis=1), 0.0)
     largest = (extinction + scattering * least) / jnp.min(cosine, axis=1)
-    largest, deepest = jax.lax.stop_gradient((largest, jnp.max(largest * half)))
-    doublings = jnp.ceil(jnp.log2(jnp.maximum(deepest, START) / START))
-    doublings = jnp.minimum(doublings, DOUBLINGS)
+    largest = jax.lax.stop_gradient(largest)
+    deepest = jax.lax.stop_gradient(jnp.max(largest * half))
+    doublings = jnp.minimum(jnp.ceil(jnp.log2(jnp.maximum(deepest / START, 1.0))), DOUBLINGS)
     thin = jnp.minimum(half * jnp.exp2(-doublings), START / jnp.maximum(largest, 1e-30))
-    return _Rates(*rates, *kernels, thin[:, None, None], doublings)
+    return _Rates(first, second, kernels[0], kernels[1], thin[:, None, None], doublings)
 
 
 def _slab(extinction, scattering, half, even, odd, cosine, chi):
@@ -271,7 +271,7 @@ def _(primals, tangents):
         dboth, dapart = both @ dy @ both, apart @ dz @ apart
         by.append((dapart - dboth, -dapart - dboth))
     # only half the thickness times a coefficient matters
-    share = 1.0 / jnp.where(half > 0, half, 1.0)
+    share = jnp.reciprocal(jnp.where(half > 0, half, 1.0))
     none = rates.odd - rates.even, -rates.even - rates.odd
     by_half = [
         jnp.where(
@@ -281,11 +281,12 @@ def _(primals, tangents):
         )
         for more, less, at_once in zip(*by, none, strict=True)
     ]
-    moved = [
-        sum(change[:, None, None] * one for change, one in zip(tangents[:3], each, strict=True))
-        for each in zip(*by, by_half, strict=True)
-    ]
-    return (both - apart, both + apart - unit), tuple(moved)
+    along = [change[:, None, None] for change in tangents[:3]]
+    r, t = (
+        along[0] * by_extinction + along[1] * by_scattering + along[2] * by_size
+        for by_extinction, by_scattering, by_size in zip(*by, by_half, strict=True)
+    )
+    return (both - apart, both + apart - unit), (r, t)
 
 
 def _mean_decay(x: Array) -> Array:
@@ -594,10 +595,9 @@ def _run(c, kinds, index, outside, roughness, incidence, order, dtype, inner, pa
         c, optics, which, counts, at = _ready(
             c, kinds, index, outside, roughness, incidence, order, dtype, parts
         )
-        with one_blas_thread():
-            out, absorbed, bottom = jax.block_until_ready(
-                _solve(c, optics, which, kinds, counts, inner)
-            )
+        out, absorbed, bottom = jax.block_until_ready(
+            _solve(c, optics, which, kinds, counts, inner)
+        )
         entered = 1.0 - at
         if inner:
             absorbed, bottom = entered[None] * absorbed, entered * bottom
@@ -743,8 +743,7 @@ def slopes(
         c, optics, which, counts, at = _ready(
             c, kinds, index, 1.0, roughness, incidence, order, dtype
         )
-        with one_blas_thread():
-            out, by = jax.block_until_ready(_solve_back(c, optics, which, kinds, counts))
+        out, by = jax.block_until_ready(_solve_back(c, optics, which, kinds, counts))
         by_part = {
             "thickness": by.thickness,
             "mu_a": by.extinction,
