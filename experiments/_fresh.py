@@ -11,7 +11,7 @@ from hylios_fit import fresnel, table, training
 from hylios_fit.skin import Specimen
 from hylios_fit.surrogate import FLOOR
 
-SEED = 20150413
+SEED = 0
 """Of the tables, as of the one that the embedded surrogate was trained on."""
 
 
