@@ -24,8 +24,9 @@ ORDERS = (4, 6, 8, 12, 16)
 FINEST = 32
 MANY = 500
 REPEATS = 3
-WALKS = 8  # of the slopes, for their standard error
+WALKS = 48  # of the slopes, for their standard error
 RAYS = 65_536
+FINE = 16  # order of the slopes that they are held against
 GOAL = 1e-4
 LEAST = 1e-4  # change of the reflectance over a parameter's whole range that a slope is of interest
 
@@ -78,7 +79,25 @@ def run(
         }
     result["many"] = _many(nm, many)
     result["slopes"] = _slopes(nm[::5], seed, presets, walks) if walks else {}
+    result["nodes"] = {name: _nodes(Specimen.preset(name), nm) for name in presets}
     return result
+
+
+def _nodes(specimen: Specimen, nm: np.ndarray) -> dict[str, float]:
+    """What the walk's few angles (`walker.NODES`) change where the angle falls with the wavelength:
+    the solver with each of them, mixed as the walk mixes them, against the solver."""
+    layers = specimen.layers(nm)
+    shares = np.asarray(walker.node_shares(layers.theta_0), float)
+    mixed = np.zeros(nm.size)
+    for node, share in zip(walker.NODES, shares, strict=True):
+        bent = layers._replace(theta_0=np.full(nm.size, node))
+        mixed += share * np.asarray(adding.skin(bent).reflectance, float)
+    error = mixed - np.asarray(adding.skin(layers).reflectance, float)
+    worst = int(np.argmax(np.abs(error)))
+    return {
+        "largest": _shared.significant(error[worst], 3), "at_nm": float(nm[worst]),
+        "rms": _shared.significant(np.sqrt(np.mean(error**2)), 3),
+    }  # fmt: skip
 
 
 def _many(nm: np.ndarray, count: int) -> dict[str, Any]:
@@ -102,7 +121,7 @@ def _slopes(nm: np.ndarray, seed: int, presets: tuple[str, ...], walks: int) -> 
     found = {}
     for name in presets:
         specimen = Specimen.preset(name)
-        _, exact = adding.slopes(specimen, nm, NAMES, order=adding.ORDER, independent=True)
+        _, exact = adding.slopes(specimen, nm, NAMES, order=FINE, independent=True)
         layers = specimen.layers(nm)
         surface = np.asarray(adding.skin(layers).surface)
         plan = walker.plan(layers)

@@ -271,7 +271,7 @@ def _(primals, tangents):
         dboth, dapart = both @ dy @ both, apart @ dz @ apart
         by.append((dapart - dboth, -dapart - dboth))
     # only half the thickness times a coefficient matters
-    share = 1.0 / jnp.where(half > 0, half, jnp.ones_like(half))
+    share = 1.0 / jnp.maximum(half, 1e-30)
     none = rates.odd - rates.even, -rates.even - rates.odd
     by_half = [
         jnp.where(
