@@ -311,11 +311,8 @@ def _fibres(absorption, fibre, thickness, even, cosine):
     return rate * _mean_decay(before + after), straight + rate * on
 
 
-def _first_hits(extinction, scattering, thickness, even, odd, cosine, chi, below):
-    """What first scattering in a clear layer adds to what it and all `below` reflect.
-
-    All that the derivative by its scattering needs, where that is none: the value is 0 there.
-    """
+def _first_hits(extinction, thickness, even, odd, cosine, chi):
+    """What (R, T) of a clear layer change by for its scattering coefficient: one hit."""
     s = cosine.shape[-1]
     root = jax.lax.rsqrt(cosine)
     sum_, difference = (
@@ -325,22 +322,22 @@ def _first_hits(extinction, scattering, thickness, even, odd, cosine, chi, below
     frame = 0.5 * thickness[:, None, None] * root[:, :, None] * root[:, None, :]
     depth = extinction[:, None] * thickness[:, None] / cosine
     into, out = depth[:, None, :], depth[:, :, None]
-    fade = jnp.exp(-depth)
-    back = frame * (sum_ - difference) * _mean_decay(into + out)
-    on = frame * (sum_ + difference) * jnp.exp(-jnp.minimum(into, out))
-    on = on * _mean_decay(jnp.abs(into - out))
-    arrives, leaves = below * fade[:, None, :], fade[:, :, None] * below
-    adds = back + on @ arrives + leaves @ on + leaves @ back @ arrives
-    return scattering[:, None, None] * jax.lax.stop_gradient(adds)
+    on = jnp.exp(-jnp.minimum(into, out)) * _mean_decay(jnp.abs(into - out))
+    back = _mean_decay(into + out)
+    return frame * (sum_ - difference) * back, frame * (sum_ + difference) * on
 
 
 # wavelengths at a time: what they need stays in the cache, and memory is bounded
 BLOCK, ACCELERATOR_BLOCK = 32, 8192
 
 
-@partial(jax.jit, static_argnames=("kinds", "counts", "inner"))
-def _solve(c: Coefficients, optics: Optics, which: Array, kinds, counts, inner: bool):
-    """(back, absorbed (m, w), bottom (w,)) in shares of the light that entered."""
+@partial(jax.jit, static_argnames=("kinds", "counts", "more"))
+def _solve(c: Coefficients, optics: Optics, which: Array, kinds, counts, more: str = ""):
+    """What comes back of the light that entered, (w,); with `more` of it:
+
+    - "inner": also what every layer absorbs (m, w), and what the bottom does or lets through (w,);
+    - "slopes": also the derivatives by every coefficient of its own wavelength, `Coefficients`.
+    """
     w = which.size
     size = min(BLOCK if jax.default_backend() == "cpu" else ACCELERATOR_BLOCK, w)
     padding = -w % size
@@ -360,13 +357,53 @@ def _solve(c: Coefficients, optics: Optics, which: Array, kinds, counts, inner: 
     )
 
     def one(block):
-        return _solve_block(block[0], optics, block[1], kinds, counts, inner)
+        return _solve_block(block[0], optics, block[1], kinds, counts, more)
 
-    out, absorbed, bottom = jax.lax.map(one, (wide, blocks(which, 0)))
-    if not inner:
-        return out.reshape(-1)[:w], None, None
-    absorbed = jnp.moveaxis(absorbed, 1, 0).reshape(absorbed.shape[1], -1)
-    return out.reshape(-1)[:w], absorbed[:, :w], bottom.reshape(-1)[:w]
+    def whole(a):
+        a = jnp.moveaxis(a, 0, -2)
+        return a.reshape(*a.shape[:-2], -1)[..., :w]
+
+    return jax.tree.map(whole, jax.lax.map(one, (wide, blocks(which, 0))))
+
+
+def _of(matrix: Array, vector: Array) -> Array:
+    return (matrix @ vector[..., None])[..., 0]
+
+
+class _Part(NamedTuple):
+    """A layer or an interface that light meets on its way down, and what lies beneath it."""
+
+    below: Float[Array, "w s s"]  # what all that lies beneath sends back up
+    through: Float[Array, "w s s"] | Float[Array, "w s"]  # a diagonal, of no more streams
+    back: Float[Array, "w s s"] | Float[Array, "w s"] | None  # what it sends back down
+    closed: Float[Array, "w s s"] | None  # (1 - below back)^-1
+
+    def down(self, light: Float[Array, "w s"]) -> tuple[Array, Array]:
+        """Light beneath it that goes (down, up), for light that comes from above."""
+        light = self._pass(light, self.through)
+        up = _of(self.below, light)
+        if self.back is not None and self.closed is not None:
+            up = _of(self.closed, up)
+            light = light + (self.back * up if self.back.ndim == 2 else _of(self.back, up))
+        return light, up
+
+    def worth(self, above: Float[Array, "w s"]) -> tuple[Array, Array]:
+        """What light beneath it that goes (down, up) is worth, if above it what goes up is worth
+        `above`: the way of `down` in the other direction."""
+        if self.through.ndim == 3:
+            up = _of(_transposed(self.through), above)
+        else:
+            up = self._pass(above, self.through)
+        if self.closed is not None:
+            up = _of(_transposed(self.closed), up)
+        return _of(_transposed(self.below), up), up
+
+    def _pass(self, light: Array, through: Array) -> Array:
+        if through.ndim == 3:
+            return _of(through, light)
+        common = through.shape[1]
+        beneath = self.below.shape[1] - common
+        return jnp.pad(through * light[:, :common], ((0, 0), (0, beneath)))
 
 
 def _solve_block(
@@ -375,7 +412,7 @@ def _solve_block(
     which: Array,
     kinds: tuple[str, ...],
     counts: tuple[int, ...],
-    inner: bool,
+    more: str,
 ):
     dtype = c.extinction.dtype
     last = len(kinds) - 1
@@ -384,12 +421,13 @@ def _solve_block(
     def unit(s):
         return jnp.eye(s, dtype=dtype)[None]
 
-    down = {}  # how the light that enters a part from above goes on, for the way down
+    parts: list[tuple[int | None, _Part]] = []  # from the bottom up; None: an interface
+    pulls = {}  # from changes of what a layer reflects and lets through to those of its numbers
     s = counts[last]
+    even_out = root[:, :s] / jnp.sqrt(jnp.sum(root[:, :s] ** 2, axis=1, keepdims=True))
     if kinds[-1] == "open":  # a medium below that nothing comes back from
         below = jnp.zeros((which.size, s, s), dtype)
     else:
-        even_out = root[:, :s] / jnp.sqrt(jnp.sum(root[:, :s] ** 2, axis=1, keepdims=True))
         below = c.bottom[:, None, None] * even_out[:, :, None] * even_out[:, None, :]
     layers = last if kinds[-1] == "open" else last + 1
     for i in reversed(range(layers)):
@@ -398,79 +436,120 @@ def _solve_block(
         if fresnel is not None:  # between this layer and the next one down
             r = fresnel[which]
             common = min(s, counts[i + 1])
-            under, over = r[:, : counts[i + 1]], r[:, :s]
-            pass_ = 1.0 - r[:, :common]
-            closed = unit(counts[i + 1]) - below * under[:, None, :]
-            down["interface", i] = (below, under, pass_)
-            inside = (_inverse(closed) @ below)[:, :common, :common]
+            under, pass_ = r[:, : counts[i + 1]], 1.0 - r[:, :common]
+            closed = _inverse(unit(counts[i + 1]) - below * under[:, None, :])
+            parts.append((None, _Part(below, pass_, under, closed)))
+            inside = (closed @ below)[:, :common, :common]
             above = jnp.zeros((which.size, s, s), dtype)
             above = above.at[:, :common, :common].set(
                 pass_[:, :, None] * inside * pass_[:, None, :]
             )
-            below = above + over[:, :, None] * unit(s)
-        mu = optics.cosine[i][which]
-        even, odd, chi = optics.even[i], optics.odd[i], c.moments[i]
+            below = above + r[:, :s, None] * unit(s)
+        answer, numbers = _layer_of(c, optics, which, kinds[i], i)
+        found: Any
+        found, pulls[i] = (
+            jax.vjp(answer, *numbers) if more == "slopes" else (answer(*numbers), None)
+        )
         if kinds[i] in ("clear", "bare"):
-            fade = jnp.exp(-c.extinction[i][:, None] * c.thickness[i][:, None] / mu)
-            down["layer", i] = (below, None, fade)
-            above = fade[:, :, None] * below * fade[:, None, :]
-            if kinds[i] == "bare":
-                assert even is not None
-                assert odd is not None
-                assert chi is not None
-                above = above + _first_hits(
-                    c.extinction[i], c.scattering[i], c.thickness[i], even[which], odd[which],
-                    mu, chi, below,
-                )  # fmt: skip
-            below = above
-            continue
-        assert even is not None
-        if kinds[i] == "fibres":
-            r, t = _fibres(c.extinction[i], c.once[i], c.thickness[i], even[which], mu)
+            parts.append((i, _Part(below, found, None, None)))
+            below = found[:, :, None] * below * found[:, None, :]
         else:
-            assert odd is not None
-            assert chi is not None
-            slab = _layer if kinds[i] == "scatter" else _slab
-            r, t = slab(
-                c.extinction[i], c.scattering[i], 0.5 * c.thickness[i], even[which], odd[which],
-                mu, chi,
-            )  # fmt: skip
-        down["layer", i] = (below, r, t)
-        below = r + t @ _inverse(unit(s) - below @ r) @ below @ t
+            r, t = found
+            closed = _inverse(unit(s) - below @ r)
+            parts.append((i, _Part(below, t, r, closed)))
+            below = r + t @ closed @ below @ t
+    parts.reverse()
     s = counts[0]
     source = optics.enters[which] / root[:, :s]
+    leaves = optics.leaves[which] * root[:, :s]
     back = optics.back[which] * root[:, None, :s] / root[:, :s, None]
-    light = _inverse(unit(s) - back @ below) @ source[:, :, None]
-    up = (below @ light)[:, :, 0]
-    out = jnp.sum(optics.leaves[which] * root[:, :s] * up, axis=1)
-    if not inner:
-        return out, None, None
-    d = light[:, :, 0]
-    absorbed = []
+    closed = _inverse(unit(s) - back @ below)
+    light = _of(closed, source)
+    up = _of(below, light)
+    out = jnp.sum(leaves * up, axis=1)
+    if not more:
+        return out
 
-    def net(d, u):
-        return jnp.sum(root[:, : d.shape[1]] * (d - u), axis=1)
+    if more == "inner":
+        return out, *_absorbed(parts, root, light, up)
+    # the way of the light that comes back, from its end: what light is worth that goes up
+    worth = leaves + _of(
+        _transposed(back), _of(_transposed(closed), _of(_transposed(below), leaves))
+    )
+    rows, light, worth = _derivatives(c, optics, which, kinds, parts, pulls, light, worth)
+    bottom = jnp.zeros_like(c.bottom)
+    if kinds[-1] != "open":
+        bottom = jnp.sum(even_out * worth, axis=1) * jnp.sum(even_out * light, axis=1)
+    return out, Coefficients(**rows, moments=(), bottom=bottom)
 
-    arrives = net(d, up)
-    for i in range(layers):
-        below, r, t = down["layer", i]
-        if r is None:
-            d = t * d
-        else:  # d = t d + r u, u = below d
-            d = (_inverse(unit(d.shape[1]) - r @ below) @ t @ d[:, :, None])[:, :, 0]
-        u = (below @ d[:, :, None])[:, :, 0]
-        leaves = net(d, u)
-        absorbed.append(arrives - leaves)
-        arrives = leaves
-        if ("interface", i) in down:
-            below, under, pass_ = down["interface", i]
-            common = pass_.shape[1]
-            start = jnp.zeros((which.size, counts[i + 1]), dtype)
-            start = start.at[:, :common].set(pass_ * d[:, :common])
-            # d = start + under * u, u = below d
-            over_ = unit(counts[i + 1]) - under[:, :, None] * below
-            d = (_inverse(over_) @ start[:, :, None])[:, :, 0]
-    return out, jnp.stack(absorbed), arrives
+
+def _absorbed(parts, root, light, up):
+    """By layer, top down (m, w), and by the bottom."""
+
+    def net(light, up):
+        return jnp.sum(root[:, : light.shape[1]] * (light - up), axis=1)
+
+    absorbed, arrives = [], net(light, up)
+    for i, part in parts:
+        light, up = part.down(light)
+        rest = net(light, up)
+        if i is not None:
+            absorbed.append(arrives - rest)
+        arrives = rest
+    return jnp.stack(absorbed), arrives
+
+
+def _derivatives(c, optics, which, kinds, parts, pulls, light, worth):
+    """By the numbers of every layer, each (m, w); and the light that goes down at the bottom, and
+    what light is worth that goes up there."""
+    none = jnp.zeros_like(c.bottom)
+    by = {name: [none] * len(kinds) for name in ("thickness", "extinction", "scattering", "once")}
+    for i, part in parts:
+        above, light, up = light, *part.down(light)
+        upward, (downward, worth) = worth, part.worth(worth)
+        if i is None:
+            continue
+        straight = kinds[i] in ("clear", "bare")
+        # what a change of what the layer reflects, and of what it lets through, is worth
+        change: Any = (
+            upward[:, :, None] * above[:, None] + downward[:, :, None] * up[:, None],
+            upward[:, :, None] * up[:, None] + downward[:, :, None] * above[:, None],
+        )
+        if straight:
+            change = upward * up + downward * above
+        for name, found in zip(_numbers(kinds[i]), pulls[i](change), strict=True):
+            by[name][i] = found
+        if kinds[i] == "bare":
+            even, odd, mu = (a[i][which] for a in (optics.even, optics.odd, optics.cosine))
+            r, t = _first_hits(c.extinction[i], c.thickness[i], even, odd, mu, c.moments[i])
+            by["scattering"][i] = jnp.sum(
+                upward * (_of(r, above) + _of(t, up)) + downward * (_of(t, above) + _of(r, up)),
+                axis=1,
+            )
+    return {name: jnp.stack(found) for name, found in by.items()}, light, worth
+
+
+def _numbers(kind: str) -> tuple[str, ...]:
+    """Of `Coefficients`, what a layer of this kind is made of."""
+    if kind in ("clear", "bare"):
+        return "extinction", "thickness"
+    return "extinction", "once" if kind == "fibres" else "scattering", "thickness"
+
+
+def _layer_of(c: Coefficients, optics: Optics, which: Array, kind: str, i: int):
+    """(function, what it is of): what layer i reflects and lets through, or what straight light
+    keeps of itself in a clear one."""
+    numbers = tuple(getattr(c, name)[i] for name in _numbers(kind))
+    mu, even, odd, chi = optics.cosine[i][which], optics.even[i], optics.odd[i], c.moments[i]
+    if kind in ("clear", "bare"):
+        return lambda lost, depth: jnp.exp(-lost[:, None] * depth[:, None] / mu), numbers
+    assert even is not None
+    if kind == "fibres":
+        return lambda lost, once, depth: _fibres(lost, once, depth, even[which], mu), numbers
+    assert odd is not None
+    rest = even[which], odd[which], mu, chi
+    slab = _layer if kind == "scatter" else _slab
+    return lambda lost, turned, depth: slab(lost, turned, 0.5 * depth, *rest), numbers
 
 
 # --- what it needs from layers and tissue ------------------------------------------------------
@@ -595,20 +674,14 @@ def _run(c, kinds, index, outside, roughness, incidence, order, dtype, inner, pa
         c, optics, which, counts, at = _ready(
             c, kinds, index, outside, roughness, incidence, order, dtype, parts
         )
-        out, absorbed, bottom = jax.block_until_ready(
-            _solve(c, optics, which, kinds, counts, inner)
-        )
         entered = 1.0 - at
+        absorbed = bottom = None
+        found = _solve(c, optics, which, kinds, counts, "inner" if inner else "")
         if inner:
+            found, absorbed, bottom = found
             absorbed, bottom = entered[None] * absorbed, entered * bottom
-        return Solution(at + entered * out, at, entered * out, absorbed, bottom)
-
-
-@partial(jax.jit, static_argnames=("kinds", "counts"))
-def _solve_back(c: Coefficients, optics: Optics, which: Array, kinds, counts):
-    """What comes back (w,), and its derivative by every coefficient of its own wavelength."""
-    out, pull = jax.vjp(lambda c: _solve(c, optics, which, kinds, counts, False)[0], c)
-    return out, pull(jnp.ones_like(out))[0]
+        solution = Solution(at + entered * found, at, entered * found, absorbed, bottom)
+        return jax.block_until_ready(solution)
 
 
 def skin(
@@ -743,7 +816,7 @@ def slopes(
         c, optics, which, counts, at = _ready(
             c, kinds, index, 1.0, roughness, incidence, order, dtype
         )
-        out, by = jax.block_until_ready(_solve_back(c, optics, which, kinds, counts))
+        out, by = _solve(c, optics, which, kinds, counts, "slopes")
         by_part = {
             "thickness": by.thickness,
             "mu_a": by.extinction,
