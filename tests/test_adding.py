@@ -171,8 +171,12 @@ def test_particles_that_the_walk_refuses_are_a_dead_length():
 
 
 def test_slopes_are_those_of_finite_differences(x64):
-    specimen = Specimen.preset("S4")
-    names = ("melanosome_basale", "colloidal_melanin", "blood_papillary", "fibre_fraction")
+    specimen = Specimen.preset("S4").replace(bottom_reflectance=0.8, reticular_scattering=5.0)
+    names = (
+        "melanosome_basale", "colloidal_melanin", "blood_papillary", "fibre_fraction",
+        "thickness_corneum", "thickness_spinosum", "thickness_papillary", "thickness_reticular",
+        "bottom_reflectance", "reticular_scattering", "reticular_scattering_power",
+    )  # fmt: skip
     value, slopes = (np.asarray(part) for part in adding.slopes(specimen, NM, names, order=6))
     assert slopes.shape == (len(names), NM.size)
 
@@ -185,6 +189,26 @@ def test_slopes_are_those_of_finite_differences(x64):
         x = specimen.values[name]
         up, down = (curve(specimen.replace(**{name: x * (1 + sign * 1e-4)})) for sign in (1, -1))
         np.testing.assert_allclose(slope, (up - down) / (2e-4 * x), rtol=1e-5, atol=1e-9)
+
+
+def test_slopes_are_those_that_jax_finds_in_the_solver(x64):
+    layers = Specimen.preset("S4").replace(reticular_scattering=5.0).layers(NM[2:4])
+
+    def total(mu_a, mu_particle, mu_fibre):
+        moved = layers._replace(mu_a=mu_a, mu_particle=mu_particle, mu_fibre=mu_fibre)
+        return jnp.sum(adding.skin(moved, order=4).reflectance)
+
+    numbers = layers.mu_a, layers.mu_particle, layers.mu_fibre
+    found = jax.grad(total, argnums=(0, 1, 2))(*numbers)
+    c, kinds, index, roughness = adding._of_skin(layers, 4, np.float64)
+    *told, at = adding._ready(c, kinds, index, 1.0, roughness, math.radians(8.0), 4, np.float64)
+    c, optics, which, counts = told
+    _, by = adding._solve(c, optics, which, kinds, counts, "slopes")
+    own = by.extinction, by.extinction + by.scattering * layers.hit_albedo, by.once[4]
+    for mine, expected, number in zip(map(np.asarray, own), found, numbers, strict=True):
+        seen = np.broadcast_to(np.asarray(number) > 0, expected.shape)
+        mine, expected = ((1.0 - np.asarray(at)) * mine)[seen], np.asarray(expected)[seen]
+        np.testing.assert_allclose(mine, expected, rtol=1e-9, atol=1e-14)
 
 
 def layer_of(extinction, albedo, depth, order=8):
