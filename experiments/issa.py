@@ -250,7 +250,7 @@ def draw(result: dict[str, Any], path: Any) -> None:
             color=_shared.COLOURS[i % len(_shared.COLOURS)], label=name,
         )  # fmt: skip
     _shared.logarithmic(cloud.yaxis)
-    cloud.legend(fontsize=7.5, title="median of the group", title_fontsize=8)
+    cloud.legend(loc="upper right", fontsize=7.5, title="median of the group", title_fontsize=8)
     rank = result["spearman_melanin_ita"]
     rho, low, high = _shared.floats([rank["rho"], *rank["interval_95"]])
     _shared.tidy(
