@@ -46,6 +46,7 @@ ORDER = 8
 ORDERS = (6, 8, 12, 16, 24, 32)
 START = 2.0  # x that the polynomial for tanh(x)/x holds to
 DOUBLINGS = 40  # at most; as many are done as the thickest layer of a block needs
+STRAIGHT = "clear", "bare"  # kinds of layers that turn no light
 OPAQUE = 1e5  # optical thickness that stands for an infinite one
 
 
@@ -187,15 +188,21 @@ class _Rates(NamedTuple):
     doublings: Float[Array, ""]
 
 
-def _rates(extinction, scattering, half, even, odd, cosine, chi) -> _Rates:
+def _kernels(even, odd, cosine, chi) -> list[Array]:
+    """What the scattering coefficient takes from E and from O."""
     s = cosine.shape[-1]
     root = jax.lax.rsqrt(cosine)
     frame = root[:, :, None] * root[:, None, :]
-    straight = frame * extinction[:, None, None] * jnp.eye(s, dtype=half.dtype)[None]
-    kernels = [
-        -frame * ((basis * moments[:, None, :s]) @ _transposed(basis))
+    return [
+        frame * ((basis * moments[:, None, :s]) @ _transposed(basis))
         for basis, moments in ((even, chi[:, 0::2]), (odd, chi[:, 1::2]))
     ]
+
+
+def _rates(extinction, scattering, half, even, odd, cosine, chi) -> _Rates:
+    unit = jnp.eye(cosine.shape[-1], dtype=half.dtype)[None]
+    straight = extinction[:, None, None] * unit / cosine[:, None, :]
+    kernels = [-kernel for kernel in _kernels(even, odd, cosine, chi)]
     first, second = (straight + scattering[:, None, None] * kernel for kernel in kernels)
     # no eigenvalue is larger
     least = jnp.maximum(-jnp.min(chi, axis=1), 0.0)
@@ -313,18 +320,13 @@ def _fibres(absorption, fibre, thickness, even, cosine):
 
 def _first_hits(extinction, thickness, even, odd, cosine, chi):
     """What (R, T) of a clear layer change by for its scattering coefficient: one hit."""
-    s = cosine.shape[-1]
-    root = jax.lax.rsqrt(cosine)
-    sum_, difference = (
-        (basis * moments[:, None, :s]) @ _transposed(basis)
-        for basis, moments in ((even, chi[:, 0::2]), (odd, chi[:, 1::2]))
-    )
-    frame = 0.5 * thickness[:, None, None] * root[:, :, None] * root[:, None, :]
+    sum_, difference = _kernels(even, odd, cosine, chi)
+    half = 0.5 * thickness[:, None, None]
     depth = extinction[:, None] * thickness[:, None] / cosine
     into, out = depth[:, None, :], depth[:, :, None]
     on = jnp.exp(-jnp.minimum(into, out)) * _mean_decay(jnp.abs(into - out))
     back = _mean_decay(into + out)
-    return frame * (sum_ - difference) * back, frame * (sum_ + difference) * on
+    return half * (sum_ - difference) * back, half * (sum_ + difference) * on
 
 
 # wavelengths at a time: what they need stays in the cache, and memory is bounded
@@ -390,10 +392,8 @@ class _Part(NamedTuple):
     def worth(self, above: Float[Array, "w s"]) -> tuple[Array, Array]:
         """What light beneath it that goes (down, up) is worth, if above it what goes up is worth
         `above`: the way of `down` in the other direction."""
-        if self.through.ndim == 3:
-            up = _of(_transposed(self.through), above)
-        else:
-            up = self._pass(above, self.through)
+        diagonal = self.through.ndim == 2
+        up = self._pass(above, self.through if diagonal else _transposed(self.through))
         if self.closed is not None:
             up = _of(_transposed(self.closed), up)
         return _of(_transposed(self.below), up), up
@@ -450,7 +450,7 @@ def _solve_block(
         found, pulls[i] = (
             jax.vjp(answer, *numbers) if more == "slopes" else (answer(*numbers), None)
         )
-        if kinds[i] in ("clear", "bare"):
+        if kinds[i] in STRAIGHT:
             parts.append((i, _Part(below, found, None, None)))
             below = found[:, :, None] * below * found[:, None, :]
         else:
@@ -509,14 +509,14 @@ def _derivatives(c, optics, which, kinds, parts, pulls, light, worth):
         upward, (downward, worth) = worth, part.worth(worth)
         if i is None:
             continue
-        straight = kinds[i] in ("clear", "bare")
         # what a change of what the layer reflects, and of what it lets through, is worth
-        change: Any = (
-            upward[:, :, None] * above[:, None] + downward[:, :, None] * up[:, None],
-            upward[:, :, None] * up[:, None] + downward[:, :, None] * above[:, None],
-        )
-        if straight:
-            change = upward * up + downward * above
+        if kinds[i] in STRAIGHT:
+            change: Any = upward * up + downward * above
+        else:
+            change = (
+                upward[:, :, None] * above[:, None] + downward[:, :, None] * up[:, None],
+                upward[:, :, None] * up[:, None] + downward[:, :, None] * above[:, None],
+            )
         for name, found in zip(_numbers(kinds[i]), pulls[i](change), strict=True):
             by[name][i] = found
         if kinds[i] == "bare":
@@ -531,7 +531,7 @@ def _derivatives(c, optics, which, kinds, parts, pulls, light, worth):
 
 def _numbers(kind: str) -> tuple[str, ...]:
     """Of `Coefficients`, what a layer of this kind is made of."""
-    if kind in ("clear", "bare"):
+    if kind in STRAIGHT:
         return "extinction", "thickness"
     return "extinction", "once" if kind == "fibres" else "scattering", "thickness"
 
@@ -541,7 +541,7 @@ def _layer_of(c: Coefficients, optics: Optics, which: Array, kind: str, i: int):
     keeps of itself in a clear one."""
     numbers = tuple(getattr(c, name)[i] for name in _numbers(kind))
     mu, even, odd, chi = optics.cosine[i][which], optics.even[i], optics.odd[i], c.moments[i]
-    if kind in ("clear", "bare"):
+    if kind in STRAIGHT:
         return lambda lost, depth: jnp.exp(-lost[:, None] * depth[:, None] / mu), numbers
     assert even is not None
     if kind == "fibres":

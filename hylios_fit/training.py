@@ -438,12 +438,13 @@ def learn_locally(
     centre, scale = x.mean(axis=0), x.std(axis=0) + np.float32(1e-6)
     middle, unit = float(log.mean()), float(log.std())
     seen = emphasis(table["wavelength_nm"].values) ** 2
+    seen /= seen.mean()
     weight, variance = np.ones_like(log), float(noise.mean()) / unit**2
     if table.attrs["generator"] == "walker":  # the errors of `adding` are no noise
         weight = 1.0 / (noise + TRUST**2)
         variance = ALIKE / float(weight.mean()) / unit**2
         weight /= weight.mean()
-    weight = (weight * seen / seen.mean()).reshape(-1)
+    weight = (weight * seen).reshape(-1)
     x, y, along = (x - centre) / scale, log.reshape(-1, 1), None
     if finer is not None:
         y = y + _order(finer, form, centre, scale, seed)(x)
@@ -458,8 +459,7 @@ def learn_locally(
         dx, dy = (np.pad(change, ((len(x), 0), (0, 0))) for change in changes)
         along = dx / scale, dy / unit
         x, y = np.concatenate([x, (inputs - centre) / scale]), np.concatenate([y, logs])
-        more = np.resize(seen / seen.mean(), len(logs))  # wavelength after wavelength
-        weight = np.concatenate([weight, more])
+        weight = np.concatenate([weight, np.resize(seen, len(logs))])  # wavelength by wavelength
     y = (y - middle) / unit
     network = Perceptron(
         LOCAL_HIDDEN, steps or LOCAL_STEPS, LOCAL_BATCH, variance=variance, seed=seed, bar=bar

@@ -585,6 +585,24 @@ def test_corners_of_the_box_count_less():
     np.testing.assert_array_equal(counts[100:], 1.0)
 
 
+def test_errors_that_the_eye_sees_count_more_and_nothing_else_changes():
+    scale = training.emphasis(np.array([300.0, 380.0, 550.0, 720.0, 725.0]))
+    np.testing.assert_array_equal(scale, np.array([1.0, 2.0, 2.0, 2.0, 1.0]))
+
+    class Linear:
+        def fit(self, x, y):
+            self.coefs_ = [np.linalg.lstsq(x, y, rcond=None)[0]]
+            self.intercepts_ = [np.zeros(y.shape[1])]
+
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(20, 3))
+    log = x @ rng.normal(size=(3, 5)) + rng.normal(size=5)
+    for factor in (1.0, scale):
+        found = training.fit(x, log, Linear(), scale=factor)
+        scores = (x - found["centre"]) / found["scale"] @ found["weight0"] + found["bias0"]
+        np.testing.assert_allclose(scores @ found["components"] + found["mean"], log, atol=1e-9)
+
+
 def test_ways_are_of_their_lengths_up_and_down_and_none_where_nothing_is():
     rng = np.random.default_rng(0)
     rows = rng.uniform(0.5, 2.0, (4000, 3)) * [1.0, 100.0, -0.01]
