@@ -13,10 +13,10 @@ Two things differ from the letter of the paper (`analog`):
 - The inside of a melanosome is averaged: a hit costs its mean survival, tabulated from the literal
   trace, whatever the particle's orientation was.
 - Where theta_0 falls from 5 degrees to 0 (780 to 1300 nm), rays of a `plan` walk with the angles
-  of `NODES`, and the reflectance is a mean over those around its own, in shares that keep the mean
-  of theta_0^2, which is what diffusion knows: long paths that bend a little differently could not
-  serve each other otherwise. This changes the reflectance a little, by 0.002 in S4 and 0.003 in
-  skin as full of melanosomes as can be (`adding` with those angles and with the one between them).
+  of `NODES`, and the reflectance is interpolated between them (`node_shares`): long paths that bend
+  a little differently could not serve each other otherwise. This changes the reflectance by at most
+  0.0007 in S4 and 0.0002 in S1 to S3, 0.001 where every stratum has 12 % of melanosomes (`adding`
+  with those angles and with the one between them).
   Where every wavelength has a column of its own, it also has its own angle.
 """
 
@@ -46,7 +46,7 @@ SUMS = 18
 NODES = scattering.LATIMER_ANGLE * np.sqrt(
     [0.0, 0.008, 0.03, 0.075, 0.14, 0.235, 0.36, 0.53, 0.74, 1.0]
 )
-APART = 0.25  # of the gaps between their squares: no further error where that is largest
+EASE = 0.004  # added to squares of angles, over the largest, in whose logarithm reflectance is even
 ROUND = 8  # steps between two exchanges of rays that ended
 LANES, ACCELERATOR_LANES = 1024, 1 << 17
 BATCH, ACCELERATOR_BATCH = 65_536, 1 << 19  # rays of one compiled call (`batch_rays`)
@@ -624,24 +624,20 @@ def _longest_first(medium: _Medium, heroes: np.ndarray, rays: int) -> np.ndarray
 
 
 def node_shares(theta_0: Float[Array, "w"]) -> Float[Array, "node w"]:
-    """Probability of each of `NODES` at each wavelength; their mean of theta^2 is theta_0^2.
+    """What each of `NODES` counts at each wavelength: Lagrange's polynomial of the third degree, in
+    log(theta^2 + `EASE`), through the four nodes around. They add up to 1; some are below 0."""
+    square = NODES[-1] ** 2
+    nodes = jnp.asarray(np.log(NODES**2 / square + EASE), theta_0.dtype)
 
-    Those of the two nodes around a square a little smaller and one a little larger, half each, so
-    that no wavelength depends on the rays of one node.
-    """
-    nodes = jnp.asarray(NODES**2, theta_0.dtype)[:, None]
-    gaps = nodes[1:] - nodes[:-1]
-    square = theta_0[None] ** 2
+    def at(place: Array) -> Array:
+        first = jnp.clip(jnp.searchsorted(nodes, place) - 2, 0, len(NODES) - 4)
+        four = first + jnp.arange(4, dtype=first.dtype)
+        x, y = jnp.broadcast_arrays(nodes[four][:, None], nodes[four][None])
+        itself = np.eye(4, dtype=bool)
+        ratios = jnp.where(itself, 1.0, (place - y) / jnp.where(itself, 1.0, x - y))
+        return jnp.zeros_like(nodes).at[four].set(jnp.prod(ratios, axis=1))
 
-    def around(square: Array) -> Array:
-        up = jnp.clip((square - nodes[:-1]) / gaps, 0.0, 1.0)  # (node - 1, w)
-        edge = jnp.ones_like(square)
-        return jnp.concatenate([edge, up]) - jnp.concatenate([up, 0.0 * edge])
-
-    apart = APART * 0.5 * (gaps[1:] + gaps[:-1])
-    away = jnp.sum(jnp.pad(apart, ((1, 1), (0, 0))) * around(square), axis=0, keepdims=True)
-    away = jnp.minimum(away, jnp.minimum(square, jnp.maximum(nodes[-1:] - square, 0.0)))
-    return 0.5 * (around(square - away) + around(square + away))
+    return jax.vmap(at, out_axes=1)(jnp.log(theta_0**2 / square + EASE))
 
 
 def hero_shares(theta_0: Float[Array, "w"]) -> Float[Array, "w"]:
@@ -692,7 +688,7 @@ def plan(layers: Layers, absorb: float = 0.4) -> Plan:
     the bright ones decide how long rays must live.
     """
     dtype = layers.mu_a.dtype
-    used = np.asarray(node_shares(layers.theta_0), float)
+    used = np.abs(np.asarray(node_shares(layers.theta_0), float))
     wide: Any = layers._replace(
         **{name: np.asarray(getattr(layers, name), float) for name in Layers._fields}
     )
