@@ -7,6 +7,7 @@ Directions are unit vectors with z pointing into the skin. A smooth interface ha
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -23,7 +24,10 @@ def reflectance(
     `cos_i` is the cosine of the angle of incidence, in [0, 1]. Total internal reflection gives 1.
     Born and Wolf, Principles of Optics, section 1.5.
     """
-    cos_t = refracted_cosine(cos_i, n1, n2)
+    return _reflected(cos_i, refracted_cosine(cos_i, n1, n2), n1, n2)
+
+
+def _reflected(cos_i: Array, cos_t: Array, n1: Array, n2: Array) -> Array:
     tiny = jnp.finfo(jnp.result_type(cos_i)).tiny
     share: Array = unpolarised(cos_i, cos_t, n1, n2, tiny)
     return jnp.where(cos_t > 0, share, jnp.ones_like(share))
@@ -103,21 +107,23 @@ def interact(
     n1: Array,
     n2: Array,
     xi: Array,
+    keep: Callable[..., tuple[Array, ...]] = lambda *values: values,
 ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
     """A Fresnel test on a facet.
 
     `facet` is the facet's normal, pointing to the side that the ray comes from, and `xi` a uniform
     number. Returns (valid, transmitted, direction). Where the facet faces away from the ray, or
     would send the outcome to the wrong side of the mean surface, `valid` is false: that facet
-    is drawn again.
+    is drawn again. `keep` is handed what several results need.
     """
-    cos_i = -(u[0] * facet[0] + u[1] * facet[1] + u[2] * facet[2])
+    cos_i, ratio = keep(-(u[0] * facet[0] + u[1] * facet[1] + u[2] * facet[2]), n1 / n2)
     c = jnp.clip(cos_i, 0.0, 1.0)
-    cos_t = refracted_cosine(c, n1, n2)
-    transmitted = xi >= reflectance(c, n1, n2)
-    ratio = n1 / n2
-    along_u = jnp.where(transmitted, ratio, 1.0)
-    along_n = jnp.where(transmitted, ratio * c - cos_t, 2.0 * c)
+    (cos_t,) = keep(refracted_cosine(c, n1, n2))
+    transmitted = xi >= _reflected(c, cos_t, n1, n2)
+    along_u, along_n = keep(
+        jnp.where(transmitted, ratio, 1.0),
+        jnp.where(transmitted, ratio * c - cos_t, 2.0 * c),
+    )
     out = unit(tuple(along_u * ui + along_n * ni for ui, ni in zip(u, facet, strict=True)))
     # the mean normal points to the side of the incoming ray: -sign(uz)
     side = jnp.where(transmitted, 1.0, -1.0) * jnp.sign(u[2])

@@ -31,8 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from hylios_fit import fresnel, melanosome, scattering
-from hylios_fit.counter import pcg4d
+from hylios_fit import counter, fresnel, melanosome, scattering
 from hylios_fit.skin import LAYERS, STRATA, Layers
 
 # What is summed along a path, in this order
@@ -47,6 +46,7 @@ NODES = scattering.LATIMER_ANGLE * np.sqrt(
     [0.0, 0.008, 0.03, 0.075, 0.14, 0.235, 0.36, 0.53, 0.74, 1.0]
 )
 EASE = 0.004  # added to squares of angles, over the largest, in whose logarithm reflectance is even
+DRAWS = 11  # random numbers that a step may take
 ROUND = 8  # steps between two exchanges of rays that ended
 LANES, ACCELERATOR_LANES = 1024, 1 << 17
 BATCH, ACCELERATOR_BATCH = 65_536, 1 << 19  # rays of one compiled call (`batch_rays`)
@@ -90,15 +90,14 @@ class _Medium(NamedTuple):
     one: Array  # 1, for `_keep`
 
 
-def _uniform(ray: Array, step: Array, stream: int, key: Array, dtype: Any) -> list[Array]:
-    """Four uniform numbers in (0, 1) for each ray, step and stream."""
-    number = step.astype(jnp.uint32) * jnp.uint32(8) + jnp.uint32(stream)
-    v = pcg4d(ray.astype(jnp.uint32), number, key)
+def _uniform(seeds: tuple[Array, Array], step: Array, draw: int, dtype: Any) -> Array:
+    """One of the `DRAWS` uniform numbers in (0, 1) of a step, for each ray."""
+    word = counter.word(seeds, step * jnp.uint32(DRAWS) + jnp.uint32(draw))
     if dtype == jnp.float32:
         # 23 bits below the 1 of a float in [1, 2), then the middle of each step
-        v = [jax.lax.bitcast_convert_type((u >> 9) | jnp.uint32(0x3F800000), dtype) for u in v]
-        return [u - dtype.type(1.0 - 2.0**-24) for u in v]
-    return [(u.astype(dtype) + 0.5) * dtype.type(2.0**-32) for u in v]
+        one_to_two = jax.lax.bitcast_convert_type((word >> 9) | jnp.uint32(0x3F800000), dtype)
+        return one_to_two - dtype.type(1.0 - 2.0**-24)
+    return (word.astype(dtype) + 0.5) * dtype.type(2.0**-32)
 
 
 def _keep(m: _Medium, *values: Array) -> tuple[Array, ...]:
@@ -152,7 +151,7 @@ FLYING, AGAIN, WAITING, ENDED, ABOVE, BELOW = range(6)
 
 
 class _Lane(NamedTuple):
-    ray: Array
+    seeds: tuple[Array, Array]  # of the ray's random numbers
     depth: Array  # below the top of the layer
     u: tuple[Array, ...]
     layer: Array  # -1 outside; 6: papillary dermis whose fibre event has happened
@@ -286,16 +285,15 @@ def _step(
     hero: Array,
     theta_0: Array,
     step: Array,
-    key: Array,
     spheroid: bool,
     below: int,
 ) -> _Lane:
     """Move every ray to its next event or interface, and let that happen."""
     dtype = lane.depth.dtype
     columns = m.event.shape[0] // 7
-    u1, u2, u3, u4 = _keep(m, *_uniform(lane.ray, step, 0, key, dtype))
-    u5, u6, u7, u8 = _keep(m, *_uniform(lane.ray, step, 1, key, dtype))
-    u9, u10, u11, _ = _keep(m, *_uniform(lane.ray, step, 2, key, dtype))
+    u1, u2, u3, u4, u5, u6, u7, u8, u9, u10, u11 = _keep(
+        m, *(_uniform(lane.seeds, step, draw, dtype) for draw in range(DRAWS))
+    )
 
     # the way to the next event
     layer = lane.layer
@@ -364,7 +362,9 @@ def _step(
     sin_s = jnp.sqrt(jnp.clip(1.0 - cos_s**2, 0.0, 1.0))
     c, s = _keep(m, *_circle(u5))
     facet = _keep(m, sin_s * c, sin_s * s, jnp.where(down, -cos_s, cos_s))
-    valid, transmitted, refracted = fresnel.interact(u, (facet[0], facet[1], facet[2]), n1, n2, u3)
+    valid, transmitted, refracted = fresnel.interact(
+        u, (facet[0], facet[1], facet[2]), n1, n2, u3, partial(_keep, m)
+    )
     # rays that the surface reflects at once are counted by quadrature: from outside, all enter
     valid = valid & (transmitted | (layer >= 0))
     valid, passes = _keep(m, _number(valid, dtype), _number(transmitted, dtype))
@@ -422,11 +422,17 @@ def _facet(m: _Medium, u: Array) -> Array:
 
 
 def _start(
-    ray: Array, incidence: Array, dtype: Any, independent: bool, spheroid: bool, exits: bool
+    ray: Array,
+    key: Array,
+    incidence: Array,
+    dtype: Any,
+    independent: bool,
+    spheroid: bool,
+    exits: bool,
 ) -> _Lane:
     zero = jnp.zeros(ray.shape, dtype)
     return _Lane(
-        ray=ray,
+        seeds=counter.seeds(ray, key),
         depth=zero,
         u=(zero + jnp.sin(incidence), zero, zero + jnp.cos(incidence)),
         layer=jnp.full(ray.shape, -1, jnp.int32),
@@ -474,7 +480,7 @@ def _walk(
 ) -> tuple[Paths, Array]:
     dtype = medium.thickness.dtype
     fresh = partial(
-        _start, incidence=incidence, dtype=dtype,
+        _start, key=key, incidence=incidence, dtype=dtype,
         independent=independent, spheroid=spheroid, exits=exits,
     )  # fmt: skip
 
@@ -487,7 +493,7 @@ def _walk(
         def one(_, carry):
             step, lane = carry
             step = step + 1
-            return step, _step(lane, medium, hero, theta_0, step, key, spheroid, below)
+            return step, _step(lane, medium, hero, theta_0, step, spheroid, below)
 
         step, lane = jax.lax.fori_loop(0, round_length, one, (step, lane))
         ended = (lane.phase >= ENDED) & (place < sent)
