@@ -27,7 +27,7 @@ from hylios_fit.walker import (
     node_shares,
 )
 
-CHUNK = 512  # rays at a time, so that memory does not depend on their number
+CHUNK = 256  # rays at a time, so that memory does not depend on their number
 GROUP = 64  # rays whose sum counts as one for the errors: columns take turns within it
 GROUPS = 256  # no fewer, or what they say of the errors is noise
 PILOT = 2048  # rays that `improve` looks at
@@ -74,7 +74,12 @@ class _Weigher(NamedTuple):
 
 
 def _weigher(
-    walked: Layers, asked: Layers, absorb: Any, shares: Array | None, own_only: bool = False
+    walked: Layers,
+    asked: Layers,
+    absorb: Any,
+    shares: Array | None,
+    own_only: bool = False,
+    positive: bool = False,
 ) -> _Weigher:
     from_walk, asked_for = log_density(walked, absorb), log_density(asked)
     # a common reference keeps the exponents small, so that float32 is enough
@@ -86,7 +91,7 @@ def _weigher(
         if shares is None:
             asked_for = asked_for + angle_density(asked.theta_0)
         else:
-            nodes = node_shares(asked.theta_0)
+            nodes = node_shares(asked.theta_0, positive)
     shares = hero_shares(walked.theta_0) if shares is None else shares
     return _Weigher(from_walk, asked_for, _log(shares), nodes)
 
@@ -293,9 +298,10 @@ def collect_bins(
 ) -> tuple[Float[Array, "bin w"], Float[Array, "bin w"]]:
     """Sums of the weights, and of their squares, of the rays in each bin.
 
-    `place` (ray,) is the bin of each ray, -1 for none. Their sum over all bins is `collect`'s.
+    `place` (ray,) is the bin of each ray, -1 for none. Their sum over all bins is `collect`'s, but
+    where that has weights below 0 (`walker.node_shares`): here none is, as no bin may be.
     """
-    weigher = _weigher(plan.layers, asked, 1.0, plan.shares, own_only)
+    weigher = _weigher(plan.layers, asked, 1.0, plan.shares, own_only, positive=True)
 
     def part(carry, chunk):
         each, at = chunk

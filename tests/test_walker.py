@@ -9,7 +9,7 @@ import pytest
 import reference
 from scipy import stats
 
-from hylios_fit import analog, fresnel, scattering, skin, tally, walker
+from hylios_fit import analog, counter, fresnel, scattering, skin, tally, walker
 from hylios_fit.skin import Specimen
 
 NM = np.array([300.0, 420.0, 550.0, 1450.0])
@@ -48,12 +48,13 @@ def found(paths, layers):
 # --- random numbers ------------------------------------------------------------------------------
 
 
-def numbers(first=0, step=0, stream=0, key=(1, 2), count=1 << 16, dtype=jnp.float32):
+def numbers(first=0, step=0, draw=0, key=(1, 2), count=1 << 16, dtype=jnp.float32):
+    """Four draws of a step, of some rays."""
     ray = jnp.arange(count, dtype=jnp.uint32) + jnp.uint32(first)
-    key = jnp.asarray(key, jnp.uint32)
+    seeds = counter.seeds(ray, jnp.asarray(key, jnp.uint32))
     return [
-        np.asarray(x, float)
-        for x in walker._uniform(ray, jnp.uint32(step), stream, key, jnp.dtype(dtype))
+        np.asarray(walker._uniform(seeds, jnp.uint32(step), draw + i, jnp.dtype(dtype)), float)
+        for i in range(4)
     ]
 
 
@@ -64,8 +65,8 @@ def independent(x, y, bins=16):
 
 
 def test_the_numbers_are_uniform(dtype):
-    for stream in range(5):
-        for x in numbers(step=3, stream=stream, dtype=dtype):
+    for draw in (0, 4, 7):
+        for x in numbers(step=3, draw=draw, dtype=dtype):
             counts, _ = np.histogram(x, 256, (0, 1))
             assert stats.chisquare(counts).pvalue > 1e-4
 
@@ -76,7 +77,7 @@ def test_the_numbers_are_independent():
         "each other": [base[(i + 1) % 4] for i in range(4)],
         "the next ray": numbers(first=1),
         "the next step": numbers(step=1),
-        "the next stream": numbers(stream=1),
+        "the next draws": numbers(draw=4),
         "another key": numbers(key=(1, 3)),
         "keys swapped": numbers(key=(2, 1)),
         "a batch later": numbers(first=walker.BATCH),
@@ -89,20 +90,25 @@ def test_the_numbers_are_independent():
 
 def test_steps_of_one_ray_are_independent():
     step = jnp.arange(1 << 16, dtype=jnp.uint32)
-    ray = jnp.full(step.shape, 7, jnp.uint32)
-    x = np.asarray(
-        walker._uniform(ray, step, 0, jnp.asarray([1, 2], jnp.uint32), jnp.dtype("float32"))
-    )
-    for i in range(4):
-        assert independent(x[i, ::2], x[i, 1::2]) > 1e-5
+    for ray in (0, 7, 1 << 31):
+        one = jnp.full(step.shape, ray, jnp.uint32)
+        seeds = counter.seeds(one, jnp.asarray([1, 2], jnp.uint32))
+        x = np.asarray(
+            [walker._uniform(seeds, step, draw, jnp.dtype("float32")) for draw in range(4)]
+        )
+        for i in range(4):
+            assert independent(x[i, ::2], x[i, 1::2]) > 1e-5
+            assert independent(x[i], x[(i + 1) % 4]) > 1e-5
 
 
 def test_the_numbers_stay_inside_the_unit_interval():
     @jax.jit
     def ends(ray):
-        key = jnp.asarray([1, 2], jnp.uint32)
-        x = walker._uniform(ray, jnp.uint32(0), 0, key, jnp.dtype("float32"))
-        return jnp.stack([jnp.min(jnp.stack(x)), jnp.max(jnp.stack(x))])
+        seeds = counter.seeds(ray, jnp.asarray([1, 2], jnp.uint32))
+        x = jnp.stack(
+            [walker._uniform(seeds, jnp.uint32(0), i, jnp.dtype("float32")) for i in range(4)]
+        )
+        return jnp.stack([jnp.min(x), jnp.max(x)])
 
     for start in range(0, 1 << 24, 1 << 22):
         low, high = np.asarray(ends(jnp.arange(start, start + (1 << 22), dtype=jnp.uint32)))
