@@ -279,16 +279,24 @@ def _order_error(form: str) -> np.ndarray:
     return np.abs(coarse - fine)
 
 
+TRACE = 1e-20  # of what melanosomes scatter, 1/cm
+
+
 def solve_rows(
     names: tuple[str, ...], parameters: np.ndarray, form: str, order: int = ADDING_ORDER
 ) -> np.ndarray:
     """Reflectance (n, w) of specimens (n, P) by adding-doubling, at the table's wavelengths.
 
-    Specimens of the same refractive indices are solved together, and none needs compiling anew.
+    Specimens of the same refractive indices are solved together. Programs are compiled for each
+    order of the indices, but not for each choice of strata without melanosomes: all have a trace.
     """
     from hylios_fit import adding
 
     medium = layers_of(names, form)(parameters)
+    strata = np.isin(skin.LAYERS, skin.STRATA)[None, :, None]
+    medium = medium._replace(
+        mu_particle=jnp.where(strata, jnp.maximum(medium.mu_particle, TRACE), medium.mu_particle)
+    )
     angle = float(np.radians(INCIDENCE_DEG))
     reflectance = np.empty((len(parameters), len(WAVELENGTHS)))
     _, group = np.unique(parameters[:, of_indices(names)], axis=0, return_inverse=True)
