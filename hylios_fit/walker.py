@@ -48,7 +48,7 @@ NODES = scattering.LATIMER_ANGLE * np.sqrt(
 )
 EASE = 0.002  # added to squares of angles, over the largest, in whose logarithm reflectance is even
 DRAWS = 11  # random numbers that a step may take
-ROUND = 8  # steps between two exchanges of rays that ended
+ROUND = 16  # steps between two exchanges of rays that ended
 LANES, ACCELERATOR_LANES = 1024, 1 << 17
 BATCH, ACCELERATOR_BATCH = 65_536, 1 << 19  # rays of one compiled call (`batch_rays`)
 
