@@ -175,9 +175,10 @@ def _walked(
             error = (1.0 - surface) * np.asarray(total.standard_error, float)
             more = 0
             if tolerance is not None and np.max(error) > tolerance and sent < MOST_RAYS:
-                # a little less, and at last a little more than is missing: the error is an estimate
+                # less where much is missing, and at last a little more: the error is an estimate,
+                # and the last rays of every lot leave lanes idle
                 missing = ((np.max(error) / tolerance) ** 2 - 1.0) * sent
-                share = 0.9 if missing > batch else 1.02
+                share = 0.9 if missing > 8 * batch else 1.03
                 more = math.ceil(share * missing / GRAIN) * GRAIN
     assert total is not None
     inside = (1.0 - surface) * np.asarray(total.mean, float)

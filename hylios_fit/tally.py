@@ -185,19 +185,20 @@ def _moments(weigher: _Weigher, paths: Paths, sent: Array, sums: bool = False):
     # groups beyond the last ray that set out are empty
     each = jnp.clip(sent - first, 1, group).astype(dtype)
 
-    def part(carry, chunk):
-        lot, rays = chunk
+    def part(i, carry):
+        lot, rays = jax.tree.map(lambda chunk: chunk[i], (chunks, each))
         weight = _weights(weigher, lot)
         grouped = jnp.sum(weight.reshape(-1, group, width), axis=1)
         w, w2, squares, by_sum = carry
         if sums:
             by_sum = by_sum + _product(lot.sums.T, weight)
         w, w2 = w + jnp.sum(grouped, axis=0), w2 + jnp.sum(weight**2, axis=0)
-        return (w, w2, squares + jnp.sum(grouped**2 / rays[:, None], axis=0), by_sum), None
+        return w, w2, squares + jnp.sum(grouped**2 / rays[:, None], axis=0), by_sum
 
     zero = jnp.zeros((SUMS if sums else 0, width), dtype)
     none = jnp.zeros(width, dtype)
-    return jax.lax.scan(part, (none, none, none, zero), (chunks, each))[0]
+    # what did not set out is not looked at
+    return jax.lax.fori_loop(0, (sent + size - 1) // size, part, (none, none, none, zero))
 
 
 @_sum_weights.defjvp
