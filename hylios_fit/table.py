@@ -46,6 +46,7 @@ GENERATORS = ("walker", "adding")
 ADDING_ORDER = 6  # of what `adding` stores
 ADDING_PARTS = (6, 8, 5, 5, 5)  # its streams in every row, so that no indices need compiling anew
 ADDING_CHECK = 12  # the order that says how much it errs
+TRACE = 1e-20  # 1/cm, the least that melanosomes scatter in rows that it solves
 WAIT = 0.2  # seconds between looks at what another process is at
 ABSORB = 0.5  # share of the absorption that ends rays on the way (the rest is in the weights)
 INCIDENCE_DEG = 8.0
@@ -279,9 +280,6 @@ def _order_error(form: str) -> np.ndarray:
     return np.abs(coarse - fine)
 
 
-TRACE = 1e-20  # of what melanosomes scatter, 1/cm
-
-
 def solve_rows(
     names: tuple[str, ...], parameters: np.ndarray, form: str, order: int = ADDING_ORDER
 ) -> np.ndarray:
@@ -293,10 +291,7 @@ def solve_rows(
     from hylios_fit import adding
 
     medium = layers_of(names, form)(parameters)
-    strata = np.isin(skin.LAYERS, skin.STRATA)[None, :, None]
-    medium = medium._replace(
-        mu_particle=jnp.where(strata, jnp.maximum(medium.mu_particle, TRACE), medium.mu_particle)
-    )
+    medium = medium._replace(mu_particle=medium.mu_particle.at[:, 1:4].max(TRACE))
     angle = float(np.radians(INCIDENCE_DEG))
     reflectance = np.empty((len(parameters), len(WAVELENGTHS)))
     _, group = np.unique(parameters[:, of_indices(names)], axis=0, return_inverse=True)

@@ -646,17 +646,16 @@ def node_shares(theta_0: Float[Array, "w"], positive: bool = False) -> Float[Arr
         return jnp.maximum(1.0 - jnp.abs(away), 0.0)
     weight, nodes = jnp.exp(-(away**2)), nodes[:, None]
     # polynomials that are orthogonal over the weighted nodes: there (`at`), and where asked (`to`)
-    at, to, before = jnp.ones_like(weight), jnp.ones_like(asked), None
+    at, to = jnp.ones_like(weight), jnp.ones_like(asked)
+    last_at, last_to, last_norm = 0.0 * at, 0.0 * to, 1.0
     shares = jnp.zeros_like(weight)
     for _ in range(3):
         norm = jnp.sum(weight * at**2, axis=0, keepdims=True)
         shares = shares + weight * at * to / norm
         middle = jnp.sum(weight * nodes * at**2, axis=0, keepdims=True) / norm
-        next_at, next_to = (nodes - middle) * at, (asked - middle) * to
-        if before:
-            ratio = norm / before[2]
-            next_at, next_to = next_at - ratio * before[0], next_to - ratio * before[1]
-        before, at, to = (at, to, norm), next_at, next_to
+        ratio, last_norm = norm / last_norm, norm
+        at, last_at = (nodes - middle) * at - ratio * last_at, at
+        to, last_to = (asked - middle) * to - ratio * last_to, to
     ends = jnp.asarray(np.eye(count)[:, [0, -1]], asked.dtype)
     shares = jnp.where(theta_0[None] > 0, shares, ends[:, :1])
     return jnp.where(theta_0[None] < (1.0 - 1e-6) * NODES[-1], shares, ends[:, 1:])

@@ -34,9 +34,9 @@ def test_the_integrals_are_the_reflectance_of_the_same_rays(found):
     brdf, bssrdf, curve = found
     # where the angle falls, one is on straight lines between angles, the other on parabolas
     falls = np.isin(curve.wavelength_nm, [900.0, 1100.0])
-    for found in (brdf.reflectance, bssrdf.reflectance):
-        np.testing.assert_allclose(found[~falls], curve.reflectance[~falls], rtol=1e-5)
-        assert np.all(np.abs(found - curve.reflectance) < curve.standard_error)
+    for integral in (brdf.reflectance, bssrdf.reflectance):
+        np.testing.assert_allclose(integral[~falls], curve.reflectance[~falls], rtol=1e-5)
+        assert np.all(np.abs(integral - curve.reflectance) < curve.standard_error)
     np.testing.assert_allclose(bssrdf.surface, curve.surface)
     surface = np.sum(brdf.surface * brdf.projected_solid_angle, axis=(1, 2))
     np.testing.assert_allclose(surface, curve.surface, rtol=1e-9)
