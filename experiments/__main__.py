@@ -16,7 +16,7 @@ from pathlib import Path
 
 import experiments
 import hylios_fit
-from hylios_fit.spectra import atomic_text
+from hylios_fit.files import atomic_text
 
 RESULTS = Path(__file__).parent / "results"
 PACKAGES = (

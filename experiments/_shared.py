@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 import hylios_fit
+from hylios_fit.files import atomic_text, load_arrays, save_arrays
 from hylios_fit.statevector import PRIORS
 from hylios_fit.table import DESIGN
 
@@ -72,22 +73,8 @@ def kept_arrays(path: Path, make: Callable[[], Mapping[str, Any]]) -> dict[str, 
 
 def save_json(path: Path, content: Any) -> None:
     """Write a .json file whole or not at all."""
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(content))
-    partial.replace(path)
-
-
-def save_arrays(path: Path, **arrays: Any) -> None:
-    """Write an .npz file whole or not at all."""
-    partial = path.with_name(f"{path.name}.partial")
-    with partial.open("wb") as file:
-        np.savez(file, **arrays)
-    partial.replace(path)
-
-
-def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as file:
-        return dict(file)
+    with atomic_text(path) as file:
+        json.dump(content, file)
 
 
 def surrogate_record(surrogate: Any) -> dict[str, Any]:

@@ -4,6 +4,8 @@ Data flows one way through the modules; each imports only from those above it:
 
     errors       the one exception for unusable input
     units        the unit system and its conversions at the edges
+    files        written whole or not at all
+    checkpoints  steps of a long computation, kept until its output is written
     threads      linear algebra held to one thread
     counter      random words from a counter
     datasets     find, read and check what is in data/

@@ -145,7 +145,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     _seed(table)
 
-    train = command("train", _train, "train a surrogate from a table")
+    train = command(
+        "train", _train, "train a surrogate from a table; interrupted, it goes on where it was"
+    )
     train.add_argument("table", metavar="TABLE")
     train.add_argument("-o", dest="output", metavar="SURROGATE", required=True)
 
@@ -398,6 +400,9 @@ def _train(args: argparse.Namespace) -> int:
     source = _existing(args.table)
     from hylios_fit import training
 
+    begun = Path(f"{output}.training")
+    if begun.exists():
+        print(f"hylios-fit: going on with {begun}", file=sys.stderr)
     print(training.train(source, output, progress=True))
     return _wrote(output)
 

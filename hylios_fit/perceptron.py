@@ -11,13 +11,16 @@ from __future__ import annotations
 import itertools
 import math
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from sklearn.base import BaseEstimator, RegressorMixin
+
+if TYPE_CHECKING:
+    from hylios_fit.checkpoints import Step
 
 TURN = 25  # steps between two turns of the eigenvectors
 WARM = 0.02  # share of the steps in which the rate rises; after it falls as a cosine does
@@ -40,11 +43,14 @@ class Perceptron(RegressorMixin, BaseEstimator):
         variance: of the targets' noise; with 0 all weights are equally probable.
         seed: of the first weights and of the batches.
         bar: a progress bar, updated `STAGES` times.
+        step: of a longer computation (`checkpoints.Step`): what is fitted is saved there after
+            each stage, and a fit of the same data goes on with it.
     """
 
     def __init__(
         self, hidden: tuple[int, ...] = (128, 128, 128), steps: int = 20_000, batch: int = 1024,
         rate: float = 3e-3, variance: float = 0.0, seed: int = 0, bar: Any = None,
+        step: Step | None = None,
     ):  # fmt: skip
         self.hidden = hidden
         self.steps = steps
@@ -53,6 +59,7 @@ class Perceptron(RegressorMixin, BaseEstimator):
         self.variance = variance
         self.seed = seed
         self.bar = bar
+        self.step = step
 
     def fit(
         self, x: Any, y: Any, sample_weight: Any = None, along: tuple[Any, Any] | None = None
@@ -77,11 +84,14 @@ class Perceptron(RegressorMixin, BaseEstimator):
         turns = max(math.ceil(self.steps / TURN), 1)
         penalty = self.variance * max(self.hidden) / len(x)
         marks = np.linspace(0, turns, STAGES + 1).astype(int)
-        for low, high in itertools.pairwise(marks):
-            layers = _descend(
-                layers, data, batches, (low, high, turns), self.rate, penalty, batch=self.batch
-            )
-            jax.block_until_ready(layers)
+        layers, done = self._saved(layers)
+        for stage, (low, high) in enumerate(itertools.pairwise(marks)):
+            if stage >= done:
+                layers = _descend(
+                    layers, data, batches, (low, high, turns), self.rate, penalty, batch=self.batch
+                )
+                jax.block_until_ready(layers)
+                self._save(layers, stage + 1)
             if self.bar is not None:
                 self.bar.update()
         self.coefs_ = [np.asarray(layer.matrix[:-1]) for layer in layers]
@@ -95,6 +105,21 @@ class Perceptron(RegressorMixin, BaseEstimator):
     def answer(self, x: Float[Array, "... f"]) -> Float[Array, "... k"]:
         """As `predict`, in JAX."""
         return _forward(self._matrices(), x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], -1)
+
+    def _saved(self, layers: tuple[_Layer, ...]) -> tuple[tuple[_Layer, ...], int]:
+        """Layers, and how many stages are done."""
+        saved = None if self.step is None else self.step.load()
+        if saved is None:
+            return layers, 0
+        parts, tree = jax.tree.flatten(layers)
+        return tree.unflatten([jnp.asarray(saved[f"{i}"]) for i in range(len(parts))]), int(
+            saved["stages"]
+        )
+
+    def _save(self, layers: tuple[_Layer, ...], stages: int) -> None:
+        if self.step is not None:
+            parts = {f"{i}": np.asarray(part) for i, part in enumerate(jax.tree.leaves(layers))}
+            self.step.save(stages=stages, **parts)
 
     def _matrices(self) -> list[Array]:
         pairs = zip(self.coefs_, self.intercepts_, strict=True)

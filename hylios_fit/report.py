@@ -23,8 +23,9 @@ from typing import Any
 import numpy as np
 
 from .errors import HyliosError
+from .files import atomic_text
 from .results import QUANTITIES, Estimate, Fit, Outcome, Posterior, read_posteriors
-from .spectra import atomic_text, write_csv
+from .spectra import write_csv
 
 SHOWN_SPECTRA = 60
 """Spectra that the page draws one by one; of more it draws a sample, and its table has them all."""

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from hylios_fit.errors import HyliosError
+from hylios_fit.files import atomic_path
 
 #: The four quantities that every result carries, in the order of every table.
 QUANTITIES = ("melanin_mg_per_mL", "blood_percent", "oxygen_saturation", "water_percent")
@@ -331,13 +332,8 @@ def write_posteriors(posteriors: Sequence[Posterior], path: str | os.PathLike[st
         {key: _plain(getattr(posterior, key)) for key in _RECORD} for posterior in posteriors
     ]
     joined.attrs["hylios_fit"] = json.dumps(records)
-    # A temporary file in the same folder: a rename is atomic only within one file system.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with atomic_path(path) as temporary:
         _inference_data(joined).to_netcdf(str(temporary), engine="h5netcdf")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
     return path
 
 

@@ -12,15 +12,15 @@ import io
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
 from .errors import HyliosError
+from .files import atomic_text
 
 WAVELENGTH_LOWER = 250.0
 """Shortest wavelength of the model, nm."""
@@ -852,28 +852,6 @@ def _from_xarray(obj: Any) -> tuple[Any, list[Any], np.ndarray]:
 
 
 # --- writing ----------------------------------------------------------------------------------
-
-
-@contextmanager
-def atomic_text(path: str | os.PathLike[str]) -> Iterator[TextIO]:
-    """A text file (UTF-8) that appears under its name only when it is complete.
-
-    Raises:
-        HyliosError: if it cannot be written.
-    """
-    path = Path(path)
-    # In the same folder, so that the replacement is one atomic rename.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(temporary, "w", encoding="utf-8", newline="") as stream:
-            yield stream
-        os.replace(temporary, path)
-    except OSError as error:
-        raise HyliosError(f"{path}: cannot be written: {error.strerror or error}") from None
-    finally:
-        with suppress(OSError):
-            temporary.unlink()
 
 
 def write_csv(

@@ -13,7 +13,6 @@ import hashlib
 import io
 import itertools
 import json
-import zipfile
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -28,6 +27,7 @@ from jaxtyping import Array, Float
 
 from hylios_fit import datasets, melanosome, skin
 from hylios_fit.errors import HyliosError
+from hylios_fit.files import atomic_path, load_arrays
 from hylios_fit.skin import LAYERS, SPECS, STRATA, Specimen
 
 FORMAT = "hylios_fit surrogate"
@@ -458,29 +458,25 @@ def _ready(surrogate: Surrogate) -> _Ready:
 def save(path: str | Path, arrays: dict[str, np.ndarray], about: dict[str, Any]) -> Path:
     """Write a surrogate file atomically; `about` is stored as JSON with a hash of the arrays."""
     path = Path(path)
-    about = {**about, "format": FORMAT, "format_version": FORMAT_VERSION, "sha256": _hash(arrays)}
+    about = {**about, "format": FORMAT, "format_version": FORMAT_VERSION, "sha256": digest(arrays)}
     buffer = io.BytesIO()
     content: dict[str, Any] = {
         "about": np.frombuffer(json.dumps(about).encode(), np.uint8),
         **arrays,
     }
     np.savez_compressed(buffer, **content)
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
+    with atomic_path(path) as temporary:
         temporary.write_bytes(buffer.getvalue())
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise HyliosError(f"cannot write the surrogate {path}: {error.strerror}") from error
     return path
 
 
-def _hash(arrays: dict[str, np.ndarray]) -> str:
-    digest = hashlib.sha256()
+def digest(arrays: dict[str, np.ndarray]) -> str:
+    """SHA-256 of arrays and their names."""
+    found = hashlib.sha256()
     for name in sorted(arrays):
-        digest.update(name.encode())
-        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
-    return digest.hexdigest()
+        found.update(name.encode())
+        found.update(np.ascontiguousarray(arrays[name]).tobytes())
+    return found.hexdigest()
 
 
 def load_surrogate(path: str | Path | None = None) -> Surrogate:
@@ -493,14 +489,11 @@ def load_surrogate(path: str | Path | None = None) -> Surrogate:
 @lru_cache(maxsize=4)
 def _load_cached(path: Path, stamp: tuple[int, int]) -> Surrogate:
     try:
-        # from memory: numpy leaves a damaged file open
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        arrays = load_arrays(path)
         about = json.loads(arrays.pop("about").tobytes())
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError) as error:
         raise HyliosError(
-            f"{path} is not a surrogate file, or is damaged or cut short ({error}): "
-            "train it again with `hylios-fit train`"
+            f"not a surrogate file, train it again with `hylios-fit train`: {error}"
         ) from error
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise HyliosError(f"{path} is an .npz file, but not a {FORMAT}")
@@ -509,7 +502,7 @@ def _load_cached(path: Path, stamp: tuple[int, int]) -> Surrogate:
             f"{path} has version {about.get('format_version')} of the surrogate's format, this "
             f"hylios_fit reads version {FORMAT_VERSION}: train it again with `hylios-fit train`"
         )
-    if about.get("sha256") != _hash(arrays):
+    if about.get("sha256") != digest(arrays):
         raise HyliosError(f"{path} is damaged: its numbers do not match their hash")
     return assemble(arrays, about)
 

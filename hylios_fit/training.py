@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hylios_fit import adding, fresnel
+from hylios_fit.checkpoints import Checkpoints, Step
 from hylios_fit.perceptron import STAGES, Perceptron
 from hylios_fit.skin import LAYERS, Layers, Specimen
 from hylios_fit.statevector import PRIORS, derived, state_vector
@@ -34,6 +35,7 @@ from hylios_fit.surrogate import (
     Surrogate,
     assemble,
     check_report,
+    digest,
     features,
     load_surrogate,
     save,
@@ -95,9 +97,16 @@ def train(
 ) -> str:
     """Train on the table and write the surrogate; returns the report that `check` prints.
 
+    What is done stays in a folder beside the output, `OUT.training`, until all is: interrupted, the
+    same call goes on there.
+
     Its error is measured on `checks` fresh specimens of each form, drawn from the prior of the
     fits, half with the usual parameters free and half with every one, and solved without noise by
     adding-doubling, whichever generator made the table.
+
+    Raises:
+        HyliosError: a table that cannot be learned from (`read_table`), a folder of another
+            training, or one that cannot be written.
     """
     from hylios_fit import __version__
 
@@ -114,7 +123,8 @@ def train(
         "upper": upper,
         "fresnel": curve.convert(domain=(0.5, 2.5)).coef,
     }
-    for form, fitted in _fits(table, forms, seed, progress).items():
+    steps = Checkpoints(f"{out_path}.training", _follows_from(table, seed))
+    for form, fitted in _fits(table, forms, seed, progress, steps).items():
         parts = {**fitted, "modes": np.zeros((1, nm.size)), "rest": np.zeros(nm.size)}
         arrays.update({f"{form}/{name}": a.astype(np.float32) for name, a in parts.items()})
 
@@ -144,7 +154,24 @@ def train(
         about["held_out_most"][form] = round(float(np.quantile(np.abs(error), 0.999)), 6)
         about["regions"][form] = _regions(names, drawn, error)
     path = save(out_path, arrays, about)
+    steps.remove()
     return check_report(load_surrogate(path))
+
+
+def _follows_from(table: Any, seed: int) -> dict[str, Any]:
+    """All that a training depends on."""
+    from hylios_fit import __version__
+
+    columns = "design", "form", "reflectance", "standard_error"
+    return {
+        "table": digest({name: table[name].values for name in columns}),
+        "seed": seed,
+        "hylios_fit": __version__,
+        "settings": [
+            LOCAL_HIDDEN, LOCAL_STEPS, LOCAL_BATCH, FINE_ORDER, FINE, ORDER_STEPS, STEEP, WAYS,
+            SPECIMENS, COMPONENTS, HIDDEN, STEPS, BATCH, SEEN, EMPHASIS, CORNERS,
+        ],
+    }  # fmt: skip
 
 
 def box_of(table: Any) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
@@ -335,42 +362,74 @@ class Finer(NamedTuple):
 
 
 def solve_slopes(
-    names: tuple[str, ...], form: str, rows: np.ndarray, bar: Any = None, every: bool = False
-) -> Slopes:
+    names: tuple[str, ...], form: str, rows: np.ndarray, bar: Any = None, every: bool = False,
+    step: Step | None = None,
+) -> Slopes:  # fmt: skip
     """By adding-doubling, for the usual parameters, or at a lower order for every one that it has a
-    derivative in; `bar` counts `STAGES`."""
+    derivative in; `bar` counts `STAGES`, `step` keeps what is solved."""
     moving = ~of_indices(names) if every else [PRIORS[name].usual for name in names]
     by = tuple(itertools.compress(names, moving))
     order = CHECK_ORDER if every else FINE_ORDER
-    found = []
-    for row in _in_stages(rows, bar):
-        specimen = Specimen(dict(zip(names, row.tolist(), strict=True)), form)
-        found.append(adding.slopes(specimen, WAVELENGTHS, by, order=order, dtype=np.float32))
-    reflectance, slopes = (np.asarray(part, float) for part in zip(*found, strict=True))
-    return Slopes(names, rows, reflectance, by, slopes)
+
+    def solve() -> dict[str, np.ndarray]:
+        found = []
+        for row in _in_stages(rows, bar):
+            specimen = Specimen(dict(zip(names, row.tolist(), strict=True)), form)
+            found.append(adding.slopes(specimen, WAVELENGTHS, by, order=order, dtype=np.float32))
+        reflectance, slopes = (np.asarray(part, float) for part in zip(*found, strict=True))
+        return {"reflectance": reflectance, "slopes": slopes}
+
+    found = _once(step, solve, bar)
+    return Slopes(names, rows, found["reflectance"], by, found["slopes"])
 
 
-def solve_finer(table: Any, form: str, asked: np.ndarray, seed: int = 0, bar: Any = None) -> Finer:
+def solve_finer(
+    table: Any, form: str, asked: np.ndarray, seed: int = 0, bar: Any = None,
+    steps: Checkpoints | None = None,
+) -> Finer:  # fmt: skip
     """Reflectances of `fresh` specimens, half with the usual parameters free and half with every
     one; and the slopes of some that are `asked`, with the usual ones free, and of others with every
-    one. `bar` counts `STAGES` of each of the three.
+    one. `bar` counts `STAGES` of each of the three, `steps` keep them.
     """
+
+    def step(name: str) -> Step | None:
+        return None if steps is None else steps.step(f"{form}-{name}")
+
     box = names, _, _ = box_of(table)
     key = jax.random.fold_in(jax.random.key(seed), 5)
     rows = np.concatenate([fresh(*box, FINE // 2, key), fresh(*box, FINE // 2, key, names)])
     lots = [rows[i : i + TOGETHER] for i in range(0, FINE, TOGETHER)]
-    orders = ADDING_ORDER, FINE_ORDER
-    found = [[solve_rows(names, lot, form, n) for n in orders] for lot in _in_stages(lots, bar)]
-    coarse, fine = (np.concatenate(part) for part in zip(*found, strict=True))
+    orders = {"coarse": ADDING_ORDER, "fine": FINE_ORDER}
+
+    def solve() -> dict[str, np.ndarray]:
+        found = [
+            [solve_rows(names, lot, form, n) for n in orders.values()]
+            for lot in _in_stages(lots, bar)
+        ]
+        parts = (np.concatenate(part) for part in zip(*found, strict=True))
+        return dict(zip(orders, parts, strict=True))
+
+    both = _once(step("order"), solve, bar)
     usual, every = STEEP
     steep = fresh(*box, every, jax.random.fold_in(jax.random.key(seed), 6), names)
     # a wavelength sees its own indices alone, whatever those of the others
     steep[:, [names.index(name) for name in FURTHER]] = 0.0
     slopes = (
-        solve_slopes(names, form, asked[_prior(len(asked)) :][:usual], bar),
-        solve_slopes(names, form, steep, bar, every=True),
+        solve_slopes(names, form, asked[_prior(len(asked)) :][:usual], bar, step=step("usual")),
+        solve_slopes(names, form, steep, bar, every=True, step=step("every")),
     )
-    return Finer(names, rows, coarse, fine, slopes)
+    return Finer(names, rows, both["coarse"], both["fine"], slopes)
+
+
+def _once(
+    step: Step | None, make: Callable[[], dict[str, np.ndarray]], bar: Any
+) -> dict[str, np.ndarray]:
+    """What `make` gives, which counts `STAGES`, or has given before."""
+    if step is None:
+        return make()
+    if bar is not None and step.path.exists():
+        bar.update(STAGES)
+    return step.once(make)
 
 
 def _in_stages(items: Any, bar: Any) -> Iterator[Any]:
@@ -424,10 +483,11 @@ def learn_locally(
     bar: Any = None,
     steps: int | None = None,
     finer: Finer | None = None,
+    step: Step | None = None,
 ) -> Local:
     """The local regression of a table's rows (`read_table`) of one form, and of what is `finer`.
 
-    `bar` counts the stages; `steps` of the optimiser, `LOCAL_STEPS` if None.
+    `bar` counts the stages, and `step` keeps them; `steps` of the optimiser, `LOCAL_STEPS` if None.
     """
     mine = table["form"].values == forms_of(table).index(form)
     axes = tuple(str(name) for name in table["parameter"].values)
@@ -462,8 +522,9 @@ def learn_locally(
         weight = np.concatenate([weight, np.resize(seen, len(logs))])  # wavelength by wavelength
     y = (y - middle) / unit
     network = Perceptron(
-        LOCAL_HIDDEN, steps or LOCAL_STEPS, LOCAL_BATCH, variance=variance, seed=seed, bar=bar
-    ).fit(x, y, weight, along)
+        LOCAL_HIDDEN, steps or LOCAL_STEPS, LOCAL_BATCH, variance=variance, seed=seed, bar=bar,
+        step=step,
+    ).fit(x, y, weight, along)  # fmt: skip
     return Local(form, network, centre, scale, middle, unit)
 
 
@@ -541,7 +602,7 @@ def _lots(rows: np.ndarray, size: int = 64) -> list[Array]:
 
 
 def _fits(
-    table: Any, forms: tuple[str, ...], seed: int, progress: bool
+    table: Any, forms: tuple[str, ...], seed: int, progress: bool, steps: Checkpoints
 ) -> dict[str, dict[str, np.ndarray]]:
     """By form: every number of the fitted pipeline by name."""
     from tqdm import tqdm
@@ -558,10 +619,12 @@ def _fits(
     ):  # fmt: skip
 
         def one(form: str) -> dict[str, np.ndarray]:
-            finer = solve_finer(table, form, asked, seed, bar) if exact else None
-            local = learn_locally(table, form, seed, bar, finer=finer)
+            finer = solve_finer(table, form, asked, seed, bar, steps) if exact else None
+            kept = steps.step(f"{form}-local")
+            local = learn_locally(table, form, seed, bar, finer=finer, step=kept)
             x, log, along = answers(local, names, asked, seed)
-            network = Perceptron(HIDDEN, STEPS, BATCH, seed=seed, bar=bar)
+            kept = steps.step(f"{form}-network")
+            network = Perceptron(HIDDEN, STEPS, BATCH, seed=seed, bar=bar, step=kept)
             seen = emphasis(table["wavelength_nm"].values)
             return fit(x, log, network, along, importance(len(asked)), seen)
 

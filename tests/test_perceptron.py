@@ -9,6 +9,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from hylios_fit import perceptron
+from hylios_fit.checkpoints import Checkpoints
 from hylios_fit.perceptron import STAGES, Perceptron
 
 
@@ -95,6 +96,31 @@ def test_the_bar_counts_the_stages():
 
     Perceptron((4,), steps=60, batch=16, bar=(bar := Bar())).fit(*smooth(100))
     assert bar.count == STAGES
+
+
+def test_interrupted_it_goes_on_to_the_same_bits(tmp_path, monkeypatch):
+    class Bar:
+        count = 0
+
+        def update(self):
+            self.count += 1
+            if self.count == 7:
+                raise KeyboardInterrupt
+
+    x, y = smooth(100)
+    network = Perceptron((4,), steps=500, batch=16, step=Checkpoints(tmp_path, {}).step("one"))
+    expected = clone(network).set_params(step=None).fit(x, y).predict(x)
+    with pytest.raises(KeyboardInterrupt):
+        clone(network).set_params(bar=(bar := Bar())).fit(x, y)
+    begun = []
+    descend = perceptron._descend
+    monkeypatch.setattr(
+        perceptron, "_descend", lambda *args, **more: begun.append(1) or descend(*args, **more)
+    )
+    found = network.set_params(bar=bar).fit(x, y)  # stages that were done are counted too
+    np.testing.assert_array_equal(found.predict(x), expected)
+    assert len(begun) == STAGES - 7
+    assert bar.count == 7 + STAGES
 
 
 def test_turning_finds_the_eigenvectors():

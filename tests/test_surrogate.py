@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hylios_fit import fresnel, table, training
+from hylios_fit import fresnel, perceptron, table, training
 from hylios_fit import surrogate as module
+from hylios_fit.checkpoints import Checkpoints
 from hylios_fit.datasets import data_path
 from hylios_fit.errors import HyliosError
 from hylios_fit.skin import Specimen
@@ -327,7 +328,7 @@ def test_a_full_disk_is_said_and_the_old_file_stays(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(HyliosError, match=r"cannot write the surrogate .*: No space left"):
+    with pytest.raises(HyliosError, match=r"cannot be written: No space left"):
         module.save(path, {}, {})
     assert path.read_bytes() == b"what was there"
     assert [file.name for file in tmp_path.iterdir()] == ["s.npz"]
@@ -375,9 +376,21 @@ def filled(path, rows=128, noise=1e-4):
     return parameters, form, exact
 
 
-def test_training_learns_a_smooth_table_and_states_its_error(tmp_path, quick):
+def test_training_learns_a_smooth_table_and_states_its_error(tmp_path, quick, monkeypatch):
     filled(tmp_path / "table.zarr", rows=512)
-    report = training.train(tmp_path / "table.zarr", tmp_path / "s.npz", checks=64, progress=False)
+    paths = tmp_path / "table.zarr", tmp_path / "s.npz"
+    # interrupted before the end, it goes on there
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "_check", raising(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            training.train(*paths, checks=64, progress=False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["s.npz.training", "table.zarr"]
+    with pytest.raises(HyliosError, match=r"s\.npz\.training holds .* with other seed"):
+        training.train(*paths, seed=1, progress=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(perceptron, "_descend", raising(AssertionError("learned twice")))
+        report = training.train(*paths, checks=64, progress=False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["s.npz", "table.zarr"]
     trained = load_surrogate(tmp_path / "s.npz")
     errors, sizes = [], []
     for form in trained.forms:
@@ -403,6 +416,13 @@ def test_training_learns_a_smooth_table_and_states_its_error(tmp_path, quick):
     regions = trained.about["regions"]["complex"]
     assert [rms for _, rms, _ in regions] == sorted((rms for _, rms, _ in regions), reverse=True)
     assert regions[0][0] in report
+
+
+def raising(error):
+    def function(*args, **more):
+        raise error
+
+    return function
 
 
 def test_training_ignores_unfinished_rows_and_says_when_too_few(tmp_path):
@@ -530,7 +550,7 @@ def test_a_walked_table_is_learned_without_what_is_finer(tmp_path, quick, monkey
     assert found.value.args == ("finer" if generator == "adding" else None,)
 
 
-def test_what_is_solved_more_finely(monkeypatch):
+def test_what_is_solved_more_finely(tmp_path, monkeypatch):
     """The solver's own tests are elsewhere: what it is asked, and what becomes of its answers."""
 
     class Bar:
@@ -555,8 +575,15 @@ def test_what_is_solved_more_finely(monkeypatch):
     monkeypatch.setattr(training, "solve_rows", solve_rows)
     rows = table._empty(128, 1, 0, "adding")
     asked = training.specimens(rows, 0, 2000)
-    finer = training.solve_finer(rows, "dispersed", asked, bar=(bar := Bar()))
+    steps = Checkpoints(tmp_path, {})
+    finer = training.solve_finer(rows, "dispersed", asked, bar=(bar := Bar()), steps=steps)
     assert bar.count == 3 * training.STAGES
+    solved = len(orders)
+    again = training.solve_finer(rows, "dispersed", asked, bar=bar, steps=steps)
+    assert (bar.count, len(orders)) == (6 * training.STAGES, solved)
+    np.testing.assert_array_equal(again.fine, finer.fine)
+    for part, same in zip(finer.slopes, again.slopes, strict=True):
+        np.testing.assert_array_equal(part.slopes, same.slopes)
     water = finer.names.index("water")
     np.testing.assert_array_equal(finer.coarse[:, 0], 6 * finer.rows[:, water])
     np.testing.assert_array_equal(finer.fine, 2 * finer.coarse)
