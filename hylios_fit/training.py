@@ -16,6 +16,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,7 +29,7 @@ from jaxtyping import Array, Float
 from hylios_fit import adding, fresnel
 from hylios_fit.checkpoints import Checkpoints, Step
 from hylios_fit.perceptron import STAGES, Perceptron
-from hylios_fit.skin import LAYERS, Layers, Specimen
+from hylios_fit.skin import Layers, Specimen
 from hylios_fit.statevector import PRIORS, derived, state_vector
 from hylios_fit.surrogate import (
     FLOOR,
@@ -289,44 +290,35 @@ def _two_fluxes(layers: Layers) -> Float[Array, "4 w"]:
     dermis and epidermis, each with all below, and out of the skin: right to some 10 %."""
     depth = layers.thickness[:, None]
     absorbed, hits = layers.mu_a * depth, layers.mu_particle * depth
-    survives = layers.hit_albedo
     bend = 1.0 - jnp.exp(-3.0 * layers.theta_0**2)  # 1 - g of a hit
-    fibre = 0.5 * (1.0 - jnp.exp(-1.5 * layers.mu_fibre * depth[4]))
     index = jnp.concatenate([jnp.ones_like(layers.index[:1]), layers.index])
 
-    def slab(k, s):
-        x = jnp.sqrt(k * (k + 2.0 * s) + 1e-6)
-        fade = jnp.exp(-2.0 * x)
-        sinh, cosh = 0.5 * (1.0 - fade) / x, 0.5 * (1.0 + fade)  # over x exp(x), over exp(x)
-        whole = cosh + (k + s) * sinh
-        return s * sinh / whole, jnp.exp(-x) / whole
+    k = 2.0 * (absorbed + hits * (1.0 - layers.hit_albedo))
+    s = 0.75 * (hits * layers.hit_albedo * bend[None] + layers.mu_tissue * depth)
+    x = jnp.sqrt(k * (k + 2.0 * s) + 1e-6)
+    fade = jnp.exp(-2.0 * x)
+    sinh, cosh = 0.5 * (1.0 - fade) / x, 0.5 * (1.0 + fade)  # over x exp(x), over exp(x)
+    whole = cosh + (k + s) * sinh
+    r, t = s * sinh / whole, jnp.exp(-x) / whole
+    fibre = 0.5 * (1.0 - jnp.exp(-1.5 * layers.mu_fibre * depth[4]))
+    through = jnp.exp(-k[4])
+    r, t = r.at[4].set(fibre * through), t.at[4].set((1.0 - fibre) * through)
 
-    def interface(above, below):
-        r = 1.5 * ((above - below) / (above + below)) ** 2
-        up = jnp.where(below > above, 1.0 - (above / below) ** 2 * (1.0 - r), r)
-        down = jnp.where(below > above, r, 1.0 - (below / above) ** 2 * (1.0 - r))
-        return up, down
+    above, below = index[:-1], index[1:]
+    turned = 1.5 * ((above - below) / (above + below)) ** 2
+    up = jnp.where(below > above, 1.0 - (above / below) ** 2 * (1.0 - turned), turned)
+    down = jnp.where(below > above, turned, 1.0 - (below / above) ** 2 * (1.0 - turned))
+
+    def layer(light: Array, own: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
+        r, t, up, down = own
+        light = r + t**2 * light / (1.0 - r * light)
+        out = (1.0 - up) * light / (1.0 - up * light)
+        return down + (1.0 - down) * out, (light, out)
 
     light = layers.bottom * jnp.ones_like(bend)
-    found = []
-    for i in reversed(range(len(LAYERS))):
-        fade = jnp.exp(-2.0 * absorbed[i])
-        if i == 0:
-            r, t = 0.0, fade
-        elif i == 4:
-            r, t = fibre * fade, (1.0 - fibre) * fade
-        elif i == 5:
-            r, t = slab(2.0 * absorbed[i], 0.75 * layers.mu_tissue[i] * depth[i])
-        else:
-            lost = absorbed[i] + hits[i] * (1.0 - survives[i])
-            r, t = slab(2.0 * lost, 0.75 * hits[i] * survives[i] * bend)
-        light = r + t**2 * light / (1.0 - r * light)
-        if i in (1, 4, 5):
-            found.append(light)
-        up, down = interface(index[i], index[i + 1])
-        out = (1.0 - up) * light / (1.0 - up * light)
-        light = down + (1.0 - down) * out if i else out  # from outside, all has entered
-    return jnp.stack([*found, light])
+    # in a loop, for as one expression it takes seconds to compile
+    _, (inside, out) = jax.lax.scan(layer, light, (r, t, up, down), reverse=True)
+    return jnp.concatenate([inside[jnp.array([5, 4, 1])], out[:1]])  # from outside, all has entered
 
 
 @lru_cache(maxsize=8)
@@ -439,7 +431,8 @@ def _in_stages(items: Any, bar: Any) -> Iterator[Any]:
             bar.update((number + 1) * STAGES // len(items) - number * STAGES // len(items))
 
 
-class Local(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Local:
     """The local regression of one form: parameters -> the logarithm of the light from inside, plus
     `FLOOR`, as a share of what entered."""
 
@@ -451,29 +444,31 @@ class Local(NamedTuple):
     unit: float
 
     def __call__(self, names: tuple[str, ...], rows: np.ndarray) -> Float[np.ndarray, "n w"]:
-        answer = jax.jit(self._function(names))
+        answer = _answer(self, names)
         return np.concatenate([answer(lot) for lot in _lots(rows)])
 
     def along(
         self, names: tuple[str, ...], rows: np.ndarray, ways: np.ndarray
     ) -> tuple[Float[np.ndarray, "n w"], Float[np.ndarray, "n w"]]:
         """What it says of rows (n, P), and how that changes along a way at each (n, P)."""
-        return _changes(self._function(names), rows, ways)
+        return _changes(_answer(self, names), rows, ways)
 
     def slopes(self, names: tuple[str, ...], rows: np.ndarray) -> Float[np.ndarray, "n w P"]:
         """How what it says of rows (n, P) changes with every parameter."""
-        function = self._function(names)
+        function = _answer(self, names)
         every = jax.jit(jax.vmap(jax.jacfwd(lambda row: function(row[None])[0])))
         return np.concatenate([every(lot) for lot in _lots(rows, 16)])
 
-    def _function(self, names: tuple[str, ...]) -> Callable[[Array], Float[Array, "n w"]]:
-        of = _inputs(names, self.form)
 
-        def answer(rows: Array) -> Array:
-            x = (of(rows) - self.centre[None, None]) / self.scale[None, None]
-            return self.network.answer(x)[..., 0] * self.unit + self.middle
+@lru_cache(maxsize=4)
+def _answer(local: Local, names: tuple[str, ...]) -> Callable[[Array], Float[Array, "n w"]]:
+    of = _inputs(names, local.form)
 
-        return answer
+    def answer(rows: Array) -> Array:
+        x = (of(rows) - local.centre[None, None]) / local.scale[None, None]
+        return local.network.answer(x)[..., 0] * local.unit + local.middle
+
+    return jax.jit(answer)
 
 
 def learn_locally(
@@ -587,10 +582,15 @@ def _changes(
     function: Callable[[Array], Array], rows: np.ndarray, ways: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """A function of rows (n, P), and how it changes along a way at each (n, P)."""
-    along = jax.jit(lambda rows, ways: jax.jvp(function, (rows,), (ways,)))
+    along = _along(function)
     found = [along(*pair) for pair in zip(_lots(rows), _lots(ways), strict=True)]
     value, change = (np.concatenate(part) for part in zip(*found, strict=True))
     return value, change
+
+
+@lru_cache(maxsize=8)
+def _along(function: Callable[[Array], Array]) -> Callable[[Array, Array], tuple[Array, Array]]:
+    return jax.jit(lambda rows, ways: jax.jvp(function, (rows,), (ways,)))
 
 
 def _lots(rows: np.ndarray, size: int = 64) -> list[Array]:
@@ -637,9 +637,14 @@ def answers(
     """Features (n, f) of specimens (n, P), what the local regression says of them (n, w), and the
     change of both along some way at each."""
     ways = _ways(asked, _lengths(local, names, asked, seed), np.random.default_rng([seed, 4]))
-    x, dx = _changes(partial(features, names, local.form), asked, ways)
+    x, dx = _changes(_features(names, local.form), asked, ways)
     log, change = local.along(names, asked, ways)
     return x.astype(float), log, (dx, change)
+
+
+@lru_cache(maxsize=8)
+def _features(names: tuple[str, ...], form: str) -> Callable[[Array], Float[Array, "n f"]]:
+    return partial(features, names, form)
 
 
 def _lengths(local: Local, names: tuple[str, ...], asked: np.ndarray, seed: int) -> np.ndarray:

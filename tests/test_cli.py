@@ -286,10 +286,11 @@ def test_a_table_is_made_trained_from_and_checked(folder, monkeypatch, capsys):
         return stand_in(rows, form, None, 1)[0]
 
     monkeypatch.setattr(table, "walk_rows", stand_in)
+    monkeypatch.setattr(table, "FORMS", ("complex",))
     monkeypatch.setattr(training, "solve", solve)
     for name, value in (
         ("HIDDEN", (8, 8)), ("LOCAL_HIDDEN", (8, 8)), ("STEPS", 90), ("LOCAL_STEPS", 90),
-        ("SPECIMENS", 512), ("COMPONENTS", 8),
+        ("SPECIMENS", 512), ("COMPONENTS", 8), ("LOOKED_AT", 16),
     ):  # fmt: skip
         monkeypatch.setattr(training, name, value)
     assert run("table", "-o", "t.zarr", "--rows", 256, "--seed", 5) == 0

@@ -357,6 +357,7 @@ def quick(monkeypatch):
     for name, value in (
         ("HIDDEN", (32, 32)), ("STEPS", 1000), ("LOCAL_HIDDEN", (24, 24)), ("LOCAL_STEPS", 2000),
         ("SPECIMENS", 2048), ("COMPONENTS", 16), ("ORDER_STEPS", 300), ("WAYS", (1, 1)),
+        ("LOOKED_AT", 16),
     ):  # fmt: skip
         monkeypatch.setattr(training, name, value)
 
@@ -379,17 +380,23 @@ def filled(path, rows=128, noise=1e-4):
 def test_training_learns_a_smooth_table_and_states_its_error(tmp_path, quick, monkeypatch):
     filled(tmp_path / "table.zarr", rows=512)
     paths = tmp_path / "table.zarr", tmp_path / "s.npz"
-    # interrupted before the end, it goes on there
+    # interrupted once the local regressions are done, it goes on there
     with monkeypatch.context() as patch:
-        patch.setattr(training, "_check", raising(KeyboardInterrupt))
+        patch.setattr(training, "answers", raising(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             training.train(*paths, checks=64, progress=False)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["s.npz.training", "table.zarr"]
     with pytest.raises(HyliosError, match=r"s\.npz\.training holds .* with other seed"):
         training.train(*paths, seed=1, progress=False)
-    with monkeypatch.context() as patch:
-        patch.setattr(perceptron, "_descend", raising(AssertionError("learned twice")))
-        report = training.train(*paths, checks=64, progress=False)
+    learned, descend = [], perceptron._descend
+
+    def counted(*args, **more):
+        learned.append(args)
+        return descend(*args, **more)
+
+    monkeypatch.setattr(perceptron, "_descend", counted)
+    report = training.train(*paths, checks=64, progress=False)
+    assert len(learned) == len(table.FORMS) * perceptron.STAGES  # the second regressions alone
     assert sorted(path.name for path in tmp_path.iterdir()) == ["s.npz", "table.zarr"]
     trained = load_surrogate(tmp_path / "s.npz")
     errors, sizes = [], []
@@ -518,14 +525,12 @@ def test_a_finer_order_and_slopes_are_learned_beyond_the_table(tmp_path, quick):
         for finer in (finer_of(rows, "dispersed"), None):
             local = training.learn_locally(rows, "dispersed", finer=finer)
             log, along = local.along(names, true.rows, ways)
-            every = local.slopes(names, true.rows[:3])
-            np.testing.assert_allclose(
-                np.einsum("nwp,np->nw", every, ways[:3]), along[:3], atol=2e-5
-            )
             found = (1.0 - surface) * np.exp(log) * along
             off.append(np.sqrt(np.mean((found - change) ** 2) / np.mean(change**2)))
             light = surface + (1.0 - surface) * (np.exp(log) - module.FLOOR)
             more.append(np.mean(light / true.reflectance) * MORE)
+    every = np.einsum("nwp,np->nw", local.slopes(names, true.rows[:3]), ways[:3])
+    np.testing.assert_allclose(every, along[:3], atol=2e-5)
     assert abs(more[0] - MORE) < 0.001
     assert abs(more[1] - 1.0) < 0.005
     assert off[0] < 0.5 * off[1]
