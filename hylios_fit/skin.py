@@ -12,6 +12,7 @@ import difflib
 import math
 import tomllib
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -247,19 +248,31 @@ def melanin_coefficient(
     values: Mapping[str, Any], wavelength_nm: np.ndarray, dtype: Any = None
 ) -> Float[Array, "w"]:
     """Absorption coefficient inside the melanosomes in 1/cm."""
-    zeta = absorbers.specific_absorption(wavelength_nm)
+    return _melanin(values, _specific_absorption(wavelength_nm, dtype))
+
+
+def absorption(
+    values: Mapping[str, Any], wavelength_nm: np.ndarray, dtype: Any = None
+) -> dict[str, Float[Array, "w"]]:
+    """Absorption coefficient of each layer in 1/cm, without the melanosomes (Eq. 2)."""
+    return _absorption(values, _specific_absorption(wavelength_nm, dtype))
+
+
+def _specific_absorption(wavelength_nm: np.ndarray, dtype: Any) -> dict[str, Float[Array, "w"]]:
+    found = absorbers.specific_absorption(wavelength_nm)
+    return {name: jnp.asarray(zeta, dtype) for name, zeta in found.items()}
+
+
+def _melanin(values: Mapping[str, Any], zeta: Mapping[str, Array]) -> Float[Array, "w"]:
+    names = "eumelanin", "pheomelanin"
     eumelanin, pheomelanin = (
-        jnp.asarray(values[name], dtype) * jnp.asarray(zeta[name], dtype)
-        for name in ("eumelanin", "pheomelanin")
+        jnp.asarray(values[name], zeta[name].dtype) * zeta[name] for name in names
     )
     return eumelanin + pheomelanin
 
 
-def blood_coefficient(
-    values: Mapping[str, Any], wavelength_nm: np.ndarray, dtype: Any = None
-) -> Float[Array, "w"]:
-    """Absorption coefficient of whole blood in 1/cm."""
-    zeta = absorbers.specific_absorption(wavelength_nm)
+def _blood(values: Mapping[str, Any], zeta: Mapping[str, Array]) -> Float[Array, "w"]:
+    """Of whole blood."""
     saturation = values["oxygen_saturation"]
     total = {
         "oxyhaemoglobin": HAEMOGLOBIN_MG_PER_ML * saturation,
@@ -268,37 +281,29 @@ def blood_coefficient(
     }
     for name in ("carboxyhaemoglobin", "methaemoglobin", "sulfhaemoglobin", "bilirubin"):
         total[name] = values[name]
-    return sum(
-        (x * jnp.asarray(zeta[n], dtype) for n, x in total.items()), start=jnp.zeros((), dtype)
-    )
+    none = jnp.zeros_like(zeta["water"])
+    return sum((x * zeta[name] for name, x in total.items()), start=none)
 
 
-def base_coefficient(
-    values: Mapping[str, Any], layer: int, wavelength_nm: np.ndarray, dtype: Any = None
-) -> Float[Array, "w"]:
-    """Absorption coefficient of a layer without its melanin and blood in 1/cm."""
-    zeta = absorbers.specific_absorption(wavelength_nm)
+def _base(values: Mapping[str, Any], layer: int, zeta: Mapping[str, Array]) -> Float[Array, "w"]:
+    """Of a layer without its melanin and blood."""
     contents = {
         "water": WATER, "lipids": LIPIDS, "keratin": KERATIN, "corneum_tail": CORNEUM_TAIL,
         "dna": DNA_MG_PER_ML, "urocanic_acid": UROCANIC_ACID_MOL_PER_L,
         "beta_carotene": BETA_CAROTENE_MG_PER_ML,
     }  # fmt: skip
     there = {name: content[layer] for name, content in contents.items() if content[layer]}
-    return sum(
-        (values[n] * x * jnp.asarray(zeta[n], dtype) for n, x in there.items()),
-        start=jnp.zeros((), dtype),
-    )
+    none = jnp.zeros_like(zeta["water"])
+    return sum((values[name] * x * zeta[name] for name, x in there.items()), start=none)
 
 
-def absorption(
-    values: Mapping[str, Any], wavelength_nm: np.ndarray, dtype: Any = None
+def _absorption(
+    values: Mapping[str, Any], zeta: Mapping[str, Array]
 ) -> dict[str, Float[Array, "w"]]:
-    """Absorption coefficient of each layer in 1/cm, without the melanosomes (Eq. 2)."""
-    melanin = melanin_coefficient(values, wavelength_nm, dtype)
-    blood = blood_coefficient(values, wavelength_nm, dtype)
+    melanin, blood = _melanin(values, zeta), _blood(values, zeta)
     mu_a = {}
     for i, layer in enumerate(LAYERS):
-        own = base_coefficient(values, i, wavelength_nm, dtype)
+        own = _base(values, i, zeta)
         if layer in STRATA:
             own = own + values["colloidal_melanin"] / 100 * melanin
         if layer in ("papillary", "reticular"):
@@ -320,10 +325,30 @@ def layers(
 ) -> Layers:
     """Coefficients of the six layers, differentiable in every value (Eqs. 2, 3 and 7)."""
     nm = np.asarray(wavelength_nm, float)
-    v = {name: jnp.asarray(value, dtype) for name, value in values.items()}
+    known = _Known(
+        zeta=_specific_absorption(nm, dtype),
+        dispersion=jnp.asarray(dispersion(nm), dtype),
+        fibre=jnp.asarray(scattering.fibre_coefficient(nm, 1.0, 1.0), dtype),
+        relative=jnp.asarray(nm / 500.0, dtype),
+        theta_0=jnp.asarray(scattering.melanosome_angle(nm), dtype),
+    )
+    return _layers({name: jnp.asarray(x, dtype) for name, x in values.items()}, known, form)
 
-    melanin = melanin_coefficient(v, nm, dtype)
-    more = v["index_dispersion"] * jnp.asarray(dispersion(nm), dtype)
+
+class _Known(NamedTuple):
+    """What depends on the wavelength alone."""
+
+    zeta: dict[str, Float[Array, "w"]]
+    dispersion: Float[Array, "w"]
+    fibre: Float[Array, "w"]  # of unit radius and fraction
+    relative: Float[Array, "w"]  # wavelength over 500 nm
+    theta_0: Float[Array, "w"]
+
+
+@partial(jax.jit, static_argnames="form")  # its many small steps one by one compile in seconds
+def _layers(v: dict[str, Array], known: _Known, form: str) -> Layers:
+    melanin = _melanin(v, known.zeta)
+    more = v["index_dispersion"] * known.dispersion
     parts = ("corneum", *("epidermis",) * 3, "papillary", "reticular")
     index = jnp.stack([v[f"index_{part}"] + more for part in parts])
 
@@ -340,19 +365,16 @@ def layers(
             mu_particle.append(jnp.zeros_like(melanin))
             albedo.append(jnp.ones_like(melanin))
 
-    radius, fraction = v["fibre_radius"], v["fibre_fraction"]
-    unit_fibre = jnp.asarray(scattering.fibre_coefficient(nm, 1.0, 1.0), dtype)
-    falling = jnp.asarray(nm / 500.0, dtype) ** -v["reticular_scattering_power"]
-    tissue = jnp.zeros_like(index).at[5].set(v["reticular_scattering"] * falling)
+    falling = known.relative ** -v["reticular_scattering_power"]
     return Layers(
         thickness=jnp.stack([v[f"thickness_{layer}"] for layer in LAYERS]),
         index=index,
-        mu_a=jnp.stack(list(absorption(v, nm, dtype).values())),
+        mu_a=jnp.stack(list(_absorption(v, known.zeta).values())),
         mu_particle=jnp.stack(mu_particle),
         hit_albedo=jnp.stack(albedo),
-        theta_0=jnp.asarray(scattering.melanosome_angle(nm), dtype),
-        mu_fibre=unit_fibre * radius**3 * fraction,
-        mu_tissue=tissue,
+        theta_0=known.theta_0,
+        mu_fibre=known.fibre * v["fibre_radius"] ** 3 * v["fibre_fraction"],
+        mu_tissue=jnp.zeros_like(index).at[5].set(v["reticular_scattering"] * falling),
         bottom=v["bottom_reflectance"],
         roughness=v["roughness"],
     )
