@@ -736,8 +736,9 @@ def _of_skin(
     angles, place = np.unique(theta_0, return_inverse=True)
     top = Streams.make((1.0, *index[:, 0]), order, parts).weight.size
     with _precision(dtype):
-        chi = jnp.asarray(streams.exponential_moments(tuple(angles), 2 * top)[place], dtype)
-        isotropic = jnp.zeros_like(chi).at[:, 0].set(1.0)
+        moments = streams.exponential_moments(tuple(angles), 2 * top)[place]
+        alone = np.broadcast_to(np.eye(1, moments.shape[1]), moments.shape)
+        chi, isotropic = (jnp.asarray(each, dtype) for each in (moments, alone))
 
         def wide(value):
             value = jnp.asarray(value, dtype)

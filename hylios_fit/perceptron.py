@@ -77,10 +77,7 @@ class Perceptron(RegressorMixin, BaseEstimator):
             data = data._replace(dx=jnp.asarray(dx, jnp.float32), dy=jnp.asarray(dy, jnp.float32))
         first, batches = jax.random.split(jax.random.key(self.seed))
         widths = (x.shape[1], *self.hidden, y.shape[1])
-        layers = tuple(
-            _start(jax.random.fold_in(first, i), wide, narrow)
-            for i, (wide, narrow) in enumerate(itertools.pairwise(widths))
-        )
+        layers = _start(first, widths)
         turns = max(math.ceil(self.steps / TURN), 1)
         penalty = self.variance * max(self.hidden) / len(x)
         marks = np.linspace(0, turns, STAGES + 1).astype(int)
@@ -146,12 +143,19 @@ class _Layer(NamedTuple):
     columns: Float[Array, "o o"]
 
 
-def _start(key: Any, wide: int, narrow: int) -> _Layer:
-    weights = jax.random.normal(key, (wide, narrow), jnp.float32) / math.sqrt(wide)
-    matrix = jnp.concatenate([weights, jnp.zeros((1, narrow), jnp.float32)])
-    none = jnp.zeros_like(matrix)
-    one = [jnp.eye(n, dtype=jnp.float32) for n in matrix.shape]
-    return _Layer(matrix, none, none, 0.0 * one[0], 0.0 * one[1], *one)
+@partial(jax.jit, static_argnames="widths")
+def _start(key: Any, widths: tuple[int, ...]) -> tuple[_Layer, ...]:
+    """Layers between so many inputs, hidden units and outputs."""
+
+    def layer(key: Any, wide: int, narrow: int) -> _Layer:
+        weights = jax.random.normal(key, (wide, narrow), jnp.float32) / math.sqrt(wide)
+        matrix = jnp.concatenate([weights, jnp.zeros((1, narrow), jnp.float32)])
+        none = jnp.zeros_like(matrix)
+        one = [jnp.eye(n, dtype=jnp.float32) for n in matrix.shape]
+        return _Layer(matrix, none, none, 0.0 * one[0], 0.0 * one[1], *one)
+
+    pairs = enumerate(itertools.pairwise(widths))
+    return tuple(layer(jax.random.fold_in(key, i), *pair) for i, pair in pairs)
 
 
 def _forward(matrices: list[Array], x: Float[Array, "n f"]) -> Float[Array, "n k"]:

@@ -382,6 +382,11 @@ def _layers(v: dict[str, Array], known: _Known, form: str) -> Layers:
 
 def let_stand(layers: Layers, values: Mapping[str, Any], form: str) -> Layers:
     """`layers` with as many particles as the walks let stand (`melanosome.accepted_share`)."""
+    return _let_stand(layers, dict(values), form)
+
+
+@partial(jax.jit, static_argnames="form")
+def _let_stand(layers: Layers, values: dict[str, Any], form: str) -> Layers:
     dtype = layers.mu_particle.dtype
     share = jnp.stack(
         [

@@ -32,6 +32,7 @@ import numpy as np
 from hylios_fit import fresnel, skin, tally, walker
 from hylios_fit.errors import HyliosError
 from hylios_fit.skin import SPECS, STRATA, Layers, Specimen
+from hylios_fit.threads import one_blas_thread
 
 if TYPE_CHECKING:
     import xarray
@@ -494,6 +495,7 @@ def generate(
     starts = [s for s in range(0, total, step) if not done[s : s + step].all()]
     with (
         tqdm(total=total, initial=int(done.sum()), unit="row", disable=not progress) as bar,
+        one_blas_thread(),
         nullcontext(executor) if executor else ThreadPoolExecutor(threads) as pool,
     ):
         while starts:

@@ -630,6 +630,7 @@ def _longest_first(medium: _Medium, heroes: np.ndarray, rays: int) -> np.ndarray
     return order
 
 
+@partial(jax.jit, static_argnames="positive")
 def node_shares(theta_0: Float[Array, "w"], positive: bool = False) -> Float[Array, "node w"]:
     """What each of `NODES` counts at each wavelength; at either end its node alone.
 
@@ -661,6 +662,7 @@ def node_shares(theta_0: Float[Array, "w"], positive: bool = False) -> Float[Arr
     return jnp.where(theta_0[None] < (1.0 - 1e-6) * NODES[-1], shares, ends[:, 1:])
 
 
+@jax.jit
 def hero_shares(theta_0: Float[Array, "w"]) -> Float[Array, "w"]:
     """Share of the rays that walk for each wavelength.
 

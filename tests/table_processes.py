@@ -17,17 +17,22 @@ import tqdm  # noqa: F401
 import zarr  # noqa: F401
 
 from hylios_fit import table
+from hylios_fit.threads import one_blas_thread
 
 CHUNKS = 3
 STEP = 8
 EVERY = 5  # of the moments at which it could be killed: before and after each rename
 
 
-def stand_in(log, pause=0.0):
+def stand_in(log, crowd=1):
+    """Rows at once, but none before so many processes are at work (or half a minute is over)."""
+
     def add_rows(parameters, form):
-        time.sleep(pause)
         with open(log, "a") as file:
             file.write(f"{os.getpid()} {form} {parameters[0]}\n".replace("\n ", " "))
+        end = time.monotonic() + 30.0
+        while len(workers(log)) < crowd and time.monotonic() < end:
+            time.sleep(0.002)
         wave = parameters.sum(axis=1)[:, None] * table.WAVELENGTHS
         return 0.5 + 0.4 * np.sin(wave), 1e-4 * (2.0 + np.cos(wave))
 
@@ -92,6 +97,10 @@ def lines(log):
     return log.read_text().splitlines() if log.exists() else []
 
 
+def workers(log):
+    return {line.partition(" ")[0] for line in lines(log)}
+
+
 def kills(folder, whole):
     """Killed at many moments, each time gone on with: chunks made twice, tables that differ."""
     found = {"moments": 0, "again": 0, "different": 0, "leftovers": 0, "failed": 0}
@@ -115,7 +124,7 @@ def kills(folder, whole):
 def together(folder, whole):
     """Three at one table, one of them killed while it is at work."""
     path, log = folder / "together.zarr", folder / "together.log"
-    table.add_rows = stand_in(log, pause=0.1)
+    table.add_rows = stand_in(log, crowd=3)
     begun = [forked(make, path, CHUNKS)]
     while not lines(log):
         time.sleep(0.002)
@@ -125,7 +134,7 @@ def together(folder, whole):
     made = [line.partition(" ") for line in lines(log) if not line.startswith(f"{begun[0]} ")]
     return {
         "statuses": statuses,
-        "workers": len({pid for pid, _, _ in made}),
+        "workers": len(workers(log)) - 1,
         "made": len(made),
         "twice": len(made) - len({what for _, _, what in made}),
         "different": content(path) != whole,
@@ -135,6 +144,7 @@ def together(folder, whole):
 def main(folder):
     table.GROUPS, table.SHARE, table.WAIT = 1, 4, 0.02
     table._empty(STEP, 0, 0)  # imports what it needs, once for all forks
+    one_blas_thread()
     table.add_rows = stand_in(folder / "whole.log")
     assert ended(forked(make, folder / "whole.zarr", CHUNKS)) == 0
     whole = content(folder / "whole.zarr")

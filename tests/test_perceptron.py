@@ -125,7 +125,7 @@ def test_interrupted_it_goes_on_to_the_same_bits(tmp_path, monkeypatch):
 
 def test_turning_finds_the_eigenvectors():
     generator = np.random.default_rng(0)
-    layer = perceptron._start(jax.random.key(0), 5, 4)
+    layer = perceptron._start(jax.random.key(0), (5, 4))[0]
     moments = []
     for size in (6, 4):
         a = generator.normal(size=(size, size))
@@ -147,7 +147,7 @@ def test_turning_finds_the_eigenvectors():
 def test_a_step_is_adam_along_the_eigenvectors(turned):
     """Two steps against Kingma and Ba (2015, algorithm 1), in coordinates that are turned."""
     generator = np.random.default_rng(0)
-    layer = perceptron._start(jax.random.key(0), 5, 4)
+    layer = perceptron._start(jax.random.key(0), (5, 4))[0]
     rows, columns = np.eye(6), np.eye(4)
     if turned:
         rows, columns = (np.linalg.qr(generator.normal(size=(n, n)))[0] for n in (6, 4))
