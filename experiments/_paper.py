@@ -63,6 +63,9 @@ class Reading:
     def in_force(self) -> Iterator[None]:
         """`instead` replaces functions of hylios_fit, which no option offers."""
         with contextlib.ExitStack() as stack:
+            if self.instead:  # what was compiled before, or in between, has the others in it
+                jax.clear_caches()
+                stack.callback(jax.clear_caches)
             for name, function in self.instead.items():
                 stack.enter_context(mock.patch(f"hylios_fit.{name}", function))
             yield

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 import hylios_fit
-from hylios_fit.files import atomic_text, load_arrays, save_arrays
+from hylios_fit.checkpoints import Step
+from hylios_fit.files import atomic_text
 from hylios_fit.statevector import PRIORS
 from hylios_fit.table import DESIGN
 
@@ -66,9 +67,7 @@ def kept(folder: Path, name: str, make: Callable[[], Any]) -> Any:
 
 def kept_arrays(path: Path, make: Callable[[], Mapping[str, Any]]) -> dict[str, np.ndarray]:
     """Arrays by name from an .npz file; made if it is not there."""
-    if not path.exists():
-        save_arrays(path, **make())
-    return load_arrays(path)
+    return Step(path).once(make)
 
 
 def save_json(path: Path, content: Any) -> None:

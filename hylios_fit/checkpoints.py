@@ -26,8 +26,11 @@ class Step(NamedTuple):
     path: Path
 
     def load(self) -> dict[str, np.ndarray] | None:
-        """What was saved last, or None."""
-        return load_arrays(self.path) if self.path.exists() else None
+        """What was saved last, or None. Raises `HyliosError` if it is damaged."""
+        try:
+            return load_arrays(self.path) if self.path.exists() else None
+        except HyliosError as error:
+            raise HyliosError(f"{error}: remove it, and this step is done again") from error
 
     def save(self, **arrays: Any) -> None:
         """In the place of what was there, at once. Raises `HyliosError` if that cannot be."""
@@ -55,13 +58,13 @@ class Checkpoints:
     def __init__(self, folder: str | Path, of: dict[str, Any]):
         self.folder = Path(folder)
         about, asked = self.folder / ABOUT, json.loads(json.dumps(of))
-        if not about.exists():
+        if not about.exists() and not any(self.folder.glob("*.npz")):
             with atomic_text(about) as file:
                 json.dump(asked, file, indent=1)
             return
         try:
-            found = json.loads(about.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+            found = dict(json.loads(about.read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError) as error:
             raise HyliosError(
                 f"{about} cannot be read ({error}): remove {self.folder} to begin anew"
             ) from error
@@ -75,6 +78,13 @@ class Checkpoints:
     def step(self, name: str) -> Step:
         return Step(self.folder / f"{name}.npz")
 
+    def begun(self) -> bool:
+        """Whether any step was saved."""
+        return any(self.folder.glob("*.npz"))
+
     def remove(self) -> None:
         """All of it, once the output is written."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        done = self.folder.with_name(f".{self.folder.name}.done")
+        shutil.rmtree(done, ignore_errors=True)  # of one that was killed here
+        self.folder.replace(done)  # at once: no step is left without what it belongs to
+        shutil.rmtree(done, ignore_errors=True)

@@ -400,9 +400,6 @@ def _train(args: argparse.Namespace) -> int:
     source = _existing(args.table)
     from hylios_fit import training
 
-    begun = Path(f"{output}.training")
-    if begun.exists():
-        print(f"hylios-fit: going on with {begun}", file=sys.stderr)
     print(training.train(source, output, progress=True))
     return _wrote(output)
 

@@ -1,4 +1,4 @@
-"""Files that appear under their names only when they are complete."""
+"""Files that appear under their names only when they are complete, and who may write them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import io
 import os
 import threading
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -65,5 +66,35 @@ def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         # from memory: numpy leaves a damaged file open
         with np.load(io.BytesIO(Path(path).read_bytes()), allow_pickle=False) as arrays:
             return dict(arrays)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (
+        OSError, ValueError, TypeError, KeyError, EOFError, NotImplementedError,
+        zipfile.BadZipFile, zlib.error,
+    ) as error:  # fmt: skip
         raise HyliosError(f"{path}: not an .npz file, or damaged or cut short ({error})") from error
+
+
+@contextmanager
+def claimed(folder: Path, wait: bool = False) -> Iterator[bool]:
+    """Whether nobody else is at work under `folder`, and will not be within this context.
+
+    The system takes the lock back when its holder ends, in whatever way. Where it has none
+    (Windows, some network drives) two may do the same work, and come to the same bits.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        yield True
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        free = True
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            free = False
+        except OSError:
+            pass  # no locks here
+        yield free
+    finally:
+        os.close(handle)

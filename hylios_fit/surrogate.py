@@ -488,19 +488,21 @@ def load_surrogate(path: str | Path | None = None) -> Surrogate:
 
 @lru_cache(maxsize=4)
 def _load_cached(path: Path, stamp: tuple[int, int]) -> Surrogate:
+    again = "train it again with `hylios-fit train`"
     try:
         arrays = load_arrays(path)
+    except HyliosError as error:
+        raise HyliosError(f"not a surrogate file, {again}: {error}") from error
+    try:
         about = json.loads(arrays.pop("about").tobytes())
     except (ValueError, KeyError) as error:
-        raise HyliosError(
-            f"not a surrogate file, train it again with `hylios-fit train`: {error}"
-        ) from error
+        raise HyliosError(f"{path} is not a surrogate file ({error}): {again}") from error
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise HyliosError(f"{path} is an .npz file, but not a {FORMAT}")
     if about.get("format_version") != FORMAT_VERSION:
         raise HyliosError(
             f"{path} has version {about.get('format_version')} of the surrogate's format, this "
-            f"hylios_fit reads version {FORMAT_VERSION}: train it again with `hylios-fit train`"
+            f"hylios_fit reads version {FORMAT_VERSION}: {again}"
         )
     if about.get("sha256") != digest(arrays):
         raise HyliosError(f"{path} is damaged: its numbers do not match their hash")

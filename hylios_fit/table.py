@@ -31,6 +31,7 @@ import numpy as np
 
 from hylios_fit import fresnel, skin, tally, walker
 from hylios_fit.errors import HyliosError
+from hylios_fit.files import claimed
 from hylios_fit.skin import SPECS, STRATA, Layers, Specimen
 from hylios_fit.threads import one_blas_thread
 
@@ -534,7 +535,7 @@ def make_chunk(path: str, start: int) -> bool:
     _same(about, folder, "was begun", hylios_fit=_version())
     part = slice(start, start + store["standard_error"].chunks[0])
     number = start // store["standard_error"].chunks[0]
-    with _writing(folder), _claimed(folder / "standard_error" / "c" / str(number)) as mine:
+    with _writing(folder), claimed(folder / "standard_error" / "c" / str(number)) as mine:
         if not mine:
             return False
         if np.isfinite(store["standard_error"][part, 0]).all():
@@ -558,7 +559,7 @@ def _begin(path: Path, empty: xarray.Dataset, step: int) -> None:
     """A table without finished rows, there at once; unless another process was faster."""
     new = path.with_name(f".{path.name}.new")
     chunks = {name: (step, *empty[name].shape[1:]) for name in COLUMNS[:4]}
-    with _claimed(path.parent, wait=True):
+    with claimed(path.parent, wait=True):
         if path.exists():
             return
         shutil.rmtree(new, ignore_errors=True)  # of one that was killed
@@ -576,7 +577,7 @@ def _extend(path: Path, rows: int | None, asked: dict[str, Any]) -> int:
 
     Standard errors grow last: a table killed on the way has its old rows, and is extended anew.
     """
-    with _claimed(path, wait=True):
+    with claimed(path, wait=True):
         store = _open(path, "r+")
         _same(store.attrs, path, "was begun", hylios_fit=_version(), **asked)
         old = store["standard_error"].shape[0]
@@ -634,30 +635,3 @@ def _writing(path: Path) -> Iterator[None]:
             f"{path}: cannot be written: {error.strerror or error}; what was there stays, "
             "`hylios-fit table --resume` goes on with it"
         ) from error
-
-
-@contextmanager
-def _claimed(folder: Path, wait: bool = False) -> Iterator[bool]:
-    """Whether nobody else is at work under `folder`, and will not be within this context.
-
-    The system takes the lock back when its holder ends, in whatever way. Where it has none
-    (Windows, some network drives) two may do the same work, and come to the same bits.
-    """
-    try:
-        import fcntl
-    except ImportError:
-        yield True
-        return
-    folder.mkdir(parents=True, exist_ok=True)
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        free = True
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
-            free = False
-        except OSError:
-            pass  # no locks here
-        yield free
-    finally:
-        os.close(handle)

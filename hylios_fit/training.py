@@ -14,11 +14,13 @@ from __future__ import annotations
 
 import itertools
 import math
+import sys
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from threading import Event
 from typing import Any, NamedTuple
 
 import jax
@@ -26,8 +28,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hylios_fit import adding, fresnel
+from hylios_fit import adding, fresnel, perceptron
 from hylios_fit.checkpoints import Checkpoints, Step
+from hylios_fit.errors import HyliosError
+from hylios_fit.files import claimed
 from hylios_fit.perceptron import STAGES, Perceptron
 from hylios_fit.skin import Layers, Specimen
 from hylios_fit.statevector import PRIORS, derived, state_vector
@@ -109,9 +113,24 @@ def train(
         HyliosError: a table that cannot be learned from (`read_table`), a folder of another
             training, or one that cannot be written.
     """
+    table = read_table(table_path, LEAST_ROWS)
+    steps = Checkpoints(f"{out_path}.training", _follows_from(table, seed))
+    with claimed(steps.folder) as mine:
+        if not mine:
+            raise HyliosError(f"another process is training {out_path}: {steps.folder} is its")
+        if progress and steps.begun():
+            print(f"going on with {steps.folder}", file=sys.stderr)
+        path = save(out_path, *_trained(table, seed, checks, progress, steps))
+        steps.remove()
+    return check_report(load_surrogate(path))
+
+
+def _trained(
+    table: Any, seed: int, checks: int, progress: bool, steps: Checkpoints
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """What the file holds: its numbers, and what is said about them."""
     from hylios_fit import __version__
 
-    table = read_table(table_path, LEAST_ROWS)
     forms = tuple(forms_of(table))
     nm = table["wavelength_nm"].values
     names, lower, upper = box_of(table)
@@ -124,7 +143,6 @@ def train(
         "upper": upper,
         "fresnel": curve.convert(domain=(0.5, 2.5)).coef,
     }
-    steps = Checkpoints(f"{out_path}.training", _follows_from(table, seed))
     for form, fitted in _fits(table, forms, seed, progress, steps).items():
         parts = {**fitted, "modes": np.zeros((1, nm.size)), "rest": np.zeros(nm.size)}
         arrays.update({f"{form}/{name}": a.astype(np.float32) for name, a in parts.items()})
@@ -154,25 +172,27 @@ def train(
         about["held_out_rms"][form] = [round(float(value), 6) for value in rms]
         about["held_out_most"][form] = round(float(np.quantile(np.abs(error), 0.999)), 6)
         about["regions"][form] = _regions(names, drawn, error)
-    path = save(out_path, arrays, about)
-    steps.remove()
-    return check_report(load_surrogate(path))
+    return arrays, about
 
 
 def _follows_from(table: Any, seed: int) -> dict[str, Any]:
-    """All that a training depends on."""
+    """All that a training depends on: the table, the seed, the version and its constants."""
     from hylios_fit import __version__
 
-    columns = "design", "form", "reflectance", "standard_error"
+    columns = "design", "form", "reflectance", "standard_error", "lower", "upper"
+    modules = {"perceptron": vars(perceptron), "training": globals()}
     return {
         "table": digest({name: table[name].values for name in columns}),
+        "generator": table.attrs["generator"],
         "seed": seed,
         "hylios_fit": __version__,
-        "settings": [
-            LOCAL_HIDDEN, LOCAL_STEPS, LOCAL_BATCH, FINE_ORDER, FINE, ORDER_STEPS, STEEP, WAYS,
-            SPECIMENS, COMPONENTS, HIDDEN, STEPS, BATCH, SEEN, EMPHASIS, CORNERS,
-        ],
-    }  # fmt: skip
+        "constants": {
+            f"{module}.{name}": repr(value)
+            for module, names in modules.items()
+            for name, value in names.items()
+            if name.isupper()
+        },
+    }
 
 
 def box_of(table: Any) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
@@ -613,10 +633,11 @@ def _fits(
         tqdm(
             total=(2 + 3 * exact) * len(forms) * STAGES, desc="train", unit="stage",
             disable=not progress,
-        ) as bar,
+        ) as stages,
         one_blas_thread(),
         ThreadPoolExecutor(THREADS) as pool,
     ):  # fmt: skip
+        bar = _Stages(stages)
 
         def one(form: str) -> dict[str, np.ndarray]:
             finer = solve_finer(table, form, asked, seed, bar, steps) if exact else None
@@ -628,7 +649,25 @@ def _fits(
             seen = emphasis(table["wavelength_nm"].values)
             return fit(x, log, network, along, importance(len(asked)), seen)
 
-        return dict(zip(forms, pool.map(one, forms), strict=True))
+        found = {pool.submit(one, form): form for form in forms}
+        try:
+            return {found[done]: done.result() for done in as_completed(found)}
+        except BaseException:
+            bar.ended.set()
+            raise
+
+
+class _Stages:
+    """The bar of several threads, which ends them all when one of them or the user has ended."""
+
+    def __init__(self, bar: Any):
+        self.bar = bar
+        self.ended = Event()
+
+    def update(self, count: int = 1) -> None:
+        if self.ended.is_set():
+            raise CancelledError
+        self.bar.update(count)
 
 
 def answers(

@@ -43,9 +43,13 @@ def test_damaged_files_are_errors(tmp_path):
     step = Checkpoints(tmp_path, OF).step("one")
     step.save(a=np.zeros(2))
     step.path.write_bytes(step.path.read_bytes()[:-30])
-    with pytest.raises(HyliosError, match=r"one\.npz: .*damaged"):
+    with pytest.raises(HyliosError, match=r"one\.npz: .*damaged .*: remove it"):
         step.load()
-    (tmp_path / "about.json").write_text("{")
+    for content in ("{", "[1]"):
+        (tmp_path / "about.json").write_text(content)
+        with pytest.raises(HyliosError, match=r"about\.json cannot be read .* begin anew"):
+            Checkpoints(tmp_path, OF)
+    (tmp_path / "about.json").unlink()  # nobody knows what the steps belong to
     with pytest.raises(HyliosError, match=r"about\.json cannot be read .* begin anew"):
         Checkpoints(tmp_path, OF)
 

@@ -3,6 +3,8 @@
 import errno
 import json
 import os
+import time
+from concurrent.futures import CancelledError
 from pathlib import Path
 
 import equinox as eqx
@@ -16,6 +18,7 @@ from hylios_fit import surrogate as module
 from hylios_fit.checkpoints import Checkpoints
 from hylios_fit.datasets import data_path
 from hylios_fit.errors import HyliosError
+from hylios_fit.files import claimed
 from hylios_fit.skin import Specimen
 from hylios_fit.surrogate import load_surrogate
 from hylios_fit.threads import one_blas_thread
@@ -423,6 +426,38 @@ def test_training_learns_a_smooth_table_and_states_its_error(tmp_path, quick, mo
     regions = trained.about["regions"]["complex"]
     assert [rms for _, rms, _ in regions] == sorted((rms for _, rms, _ in regions), reverse=True)
     assert regions[0][0] in report
+
+
+def test_when_one_thread_fails_the_other_ends_too(tmp_path, quick, monkeypatch):
+    ended = []
+
+    def learn_locally(table, form, seed, bar, **_):
+        if form == "dispersed":
+            raise HyliosError("no space")
+        try:
+            for _ in range(3000):
+                bar.update(0)
+                time.sleep(0.01)
+        except CancelledError:
+            ended.append(form)
+            raise
+
+    monkeypatch.setattr(training, "learn_locally", learn_locally)
+    filled(tmp_path / "table.zarr")
+    with pytest.raises(HyliosError, match="no space"):
+        training.train(tmp_path / "table.zarr", tmp_path / "s.npz", progress=False)
+    assert ended == ["complex"]
+
+
+def test_two_do_not_train_one_surrogate(tmp_path, quick, monkeypatch):
+    pytest.importorskip("fcntl")
+    monkeypatch.setattr(training, "_trained", raising(AssertionError("trained twice")))
+    filled(tmp_path / "table.zarr")
+    with (
+        claimed(tmp_path / "s.npz.training"),
+        pytest.raises(HyliosError, match=r"another process is training .*s\.npz"),
+    ):
+        training.train(tmp_path / "table.zarr", tmp_path / "s.npz", progress=False)
 
 
 def raising(error):

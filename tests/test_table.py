@@ -13,6 +13,7 @@ import pytest
 
 from hylios_fit import table
 from hylios_fit.errors import HyliosError
+from hylios_fit.files import claimed
 from hylios_fit.skin import SPECS, STRATA, Specimen
 
 RAYS = 256
@@ -398,7 +399,7 @@ def test_processes_share_a_table_and_take_over_from_one_that_was_killed(processe
 def test_a_chunk_that_another_is_at_is_left_to_it(quick, tmp_path):
     pytest.importorskip("fcntl")
     path = empty(tmp_path / "t.zarr")
-    with table._claimed(path / "standard_error" / "c" / "0") as mine:
+    with claimed(path / "standard_error" / "c" / "0") as mine:
         assert mine
         assert not table.make_chunk(str(path), 0)
         assert not quick
