@@ -383,7 +383,7 @@ def filled(path, rows=128, noise=1e-4):
 def test_training_learns_a_smooth_table_and_states_its_error(tmp_path, quick, monkeypatch):
     filled(tmp_path / "table.zarr", rows=512)
     paths = tmp_path / "table.zarr", tmp_path / "s.npz"
-    # interrupted once the local regressions are done, it goes on there
+    # interrupted once a local regression is done, it goes on there
     with monkeypatch.context() as patch:
         patch.setattr(training, "answers", raising(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
@@ -399,7 +399,8 @@ def test_training_learns_a_smooth_table_and_states_its_error(tmp_path, quick, mo
 
     monkeypatch.setattr(perceptron, "_descend", counted)
     report = training.train(*paths, checks=64, progress=False)
-    assert len(learned) == len(table.FORMS) * perceptron.STAGES  # the second regressions alone
+    # both second regressions, and of the first ones none that was interrupted at its end
+    assert 2 <= len(learned) / perceptron.STAGES <= 3
     assert sorted(path.name for path in tmp_path.iterdir()) == ["s.npz", "table.zarr"]
     trained = load_surrogate(tmp_path / "s.npz")
     errors, sizes = [], []
