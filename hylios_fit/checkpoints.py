@@ -34,7 +34,7 @@ class Step(NamedTuple):
 
     def save(self, **arrays: Any) -> None:
         """In the place of what was there, at once. Raises `HyliosError` if that cannot be."""
-        save_arrays(self.path, **arrays)
+        save_arrays(self.path, arrays)
 
     def once(self, make: Callable[[], Mapping[str, Any]]) -> dict[str, np.ndarray]:
         """The arrays by name, made and saved if they are not there."""
@@ -58,7 +58,7 @@ class Checkpoints:
     def __init__(self, folder: str | Path, of: dict[str, Any]):
         self.folder = Path(folder)
         about, asked = self.folder / ABOUT, json.loads(json.dumps(of))
-        if not about.exists() and not any(self.folder.glob("*.npz")):
+        if not about.exists() and not self.begun():
             with atomic_text(about) as file:
                 json.dump(asked, file, indent=1)
             return

@@ -7,7 +7,7 @@ import os
 import threading
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
@@ -48,10 +48,13 @@ def atomic_text(path: str | os.PathLike[str]) -> Iterator[TextIO]:
         yield stream
 
 
-def save_arrays(path: str | os.PathLike[str], **arrays: Any) -> None:
+def save_arrays(
+    path: str | os.PathLike[str], arrays: Mapping[str, Any], compress: bool = False
+) -> None:
     """An .npz file of arrays by name. Raises as `atomic_path`."""
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)
+    write = np.savez_compressed if compress else np.savez
+    write(buffer, allow_pickle=False, **arrays)
     with atomic_path(path) as temporary:
         temporary.write_bytes(buffer.getvalue())
 
@@ -66,7 +69,7 @@ def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         # from memory: numpy leaves a damaged file open
         with np.load(io.BytesIO(Path(path).read_bytes()), allow_pickle=False) as arrays:
             return dict(arrays)
-    except (
+    except (  # damage in a zip archive shows as any of these, such as a compression that is none
         OSError, ValueError, TypeError, KeyError, EOFError, NotImplementedError,
         zipfile.BadZipFile, zlib.error,
     ) as error:  # fmt: skip

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from sklearn.base import BaseEstimator, RegressorMixin
 
-if TYPE_CHECKING:
-    from hylios_fit.checkpoints import Step
+from hylios_fit.checkpoints import Step
 
 TURN = 25  # steps between two turns of the eigenvectors
 WARM = 0.02  # share of the steps in which the rate rises; after it falls as a cosine does
@@ -108,10 +107,9 @@ class Perceptron(RegressorMixin, BaseEstimator):
         saved = None if self.step is None else self.step.load()
         if saved is None:
             return layers, 0
-        parts, tree = jax.tree.flatten(layers)
-        return tree.unflatten([jnp.asarray(saved[f"{i}"]) for i in range(len(parts))]), int(
-            saved["stages"]
-        )
+        tree = jax.tree.structure(layers)
+        parts = [jnp.asarray(saved[f"{i}"]) for i in range(tree.num_leaves)]
+        return tree.unflatten(parts), int(saved["stages"])
 
     def _save(self, layers: tuple[_Layer, ...], stages: int) -> None:
         if self.step is not None:

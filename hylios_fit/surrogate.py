@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import io
 import itertools
 import json
 from collections.abc import Callable
@@ -27,7 +26,7 @@ from jaxtyping import Array, Float
 
 from hylios_fit import datasets, melanosome, skin
 from hylios_fit.errors import HyliosError
-from hylios_fit.files import atomic_path, load_arrays
+from hylios_fit.files import load_arrays, save_arrays
 from hylios_fit.skin import LAYERS, SPECS, STRATA, Specimen
 
 FORMAT = "hylios_fit surrogate"
@@ -459,14 +458,8 @@ def save(path: str | Path, arrays: dict[str, np.ndarray], about: dict[str, Any])
     """Write a surrogate file atomically; `about` is stored as JSON with a hash of the arrays."""
     path = Path(path)
     about = {**about, "format": FORMAT, "format_version": FORMAT_VERSION, "sha256": digest(arrays)}
-    buffer = io.BytesIO()
-    content: dict[str, Any] = {
-        "about": np.frombuffer(json.dumps(about).encode(), np.uint8),
-        **arrays,
-    }
-    np.savez_compressed(buffer, **content)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(buffer.getvalue())
+    text = np.frombuffer(json.dumps(about).encode(), np.uint8)
+    save_arrays(path, {"about": text, **arrays}, compress=True)
     return path
 
 

@@ -451,7 +451,7 @@ def _in_stages(items: Any, bar: Any) -> Iterator[Any]:
             bar.update((number + 1) * STAGES // len(items) - number * STAGES // len(items))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False)  # known by identity: what is compiled for it is found again
 class Local:
     """The local regression of one form: parameters -> the logarithm of the light from inside, plus
     `FLOOR`, as a share of what entered."""
@@ -683,6 +683,7 @@ def answers(
 
 @lru_cache(maxsize=8)
 def _features(names: tuple[str, ...], form: str) -> Callable[[Array], Float[Array, "n f"]]:
+    """One function for each, so that `_along` compiles it once."""
     return partial(features, names, form)
 
 
