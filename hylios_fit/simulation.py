@@ -178,7 +178,7 @@ def _walked(
                 # less where much is missing, and at last a little more: the error is an estimate,
                 # and the last rays of every lot leave lanes idle
                 missing = ((np.max(error) / tolerance) ** 2 - 1.0) * sent
-                share = 0.9 if missing > 8 * batch else 1.03
+                share = 0.9 if missing > 8 * batch else 1.05
                 more = math.ceil(share * missing / GRAIN) * GRAIN
     assert total is not None
     inside = (1.0 - surface) * np.asarray(total.mean, float)

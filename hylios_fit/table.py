@@ -257,6 +257,7 @@ def walk_rows(
             paths.sums.reshape(rays, count, -1)[:, g],
             paths.escaped.reshape(rays, count)[:, g],
             jnp.asarray(own[:, g], jnp.int32),
+            paths.end.reshape(rays, count)[:, g],
         )
         base = Layers(*(part[g] for part in walked))
         for row in range(g * SHARE, (g + 1) * SHARE):

@@ -16,21 +16,28 @@ from jaxtyping import Array, Float
 
 from hylios_fit.skin import Layers
 from hylios_fit.walker import (
+    ENDS,
     NEVER,
     NODES,
     SUMS,
     Paths,
     Plan,
     angle_density,
+    end_density,
     hero_shares,
     log_density,
     node_shares,
 )
 
-CHUNK = 256  # rays at a time, so that memory does not depend on their number
+CHUNK = 64  # rays at a time, so that memory does not depend on their number
 GROUP = 64  # rays whose sum counts as one for the errors: columns take turns within it
 GROUPS = 256  # no fewer, or what they say of the errors is noise
 PILOT = 2048  # rays that `improve` looks at
+WATCHED = 128  # wavelengths whose errors shares are chosen by
+TINY = 1e-9
+FOLDS = 8  # of the rays of a sum: what each takes off the others say
+ENOUGH = 16_384  # rays that say it
+RIDGE = 0.05  # of the second moment of what is known, so that its scatter is not learned
 
 
 class Tally(NamedTuple):
@@ -71,6 +78,7 @@ class _Weigher(NamedTuple):
     asked: Array  # (18, w)
     log_share: Array  # (k,)
     nodes: Array | None  # (node, w): what each counts, where `asked` leaves the angles out
+    ends: Array | None  # (11, k), of what ended a ray inside, where that is asked for
 
 
 def _weigher(
@@ -80,6 +88,7 @@ def _weigher(
     shares: Array | None,
     own_only: bool = False,
     positive: bool = False,
+    ended: bool = False,
 ) -> _Weigher:
     from_walk, asked_for = log_density(walked, absorb), log_density(asked)
     # a common reference keeps the exponents small, so that float32 is enough
@@ -93,7 +102,8 @@ def _weigher(
         else:
             nodes = node_shares(asked.theta_0, positive)
     shares = hero_shares(walked.theta_0) if shares is None else shares
-    return _Weigher(from_walk, asked_for, _log(shares), nodes)
+    ends = end_density(walked, absorb) if ended else None
+    return _Weigher(from_walk, asked_for, _log(shares), nodes, ends)
 
 
 def _log(share: Array) -> Array:
@@ -110,8 +120,25 @@ _product = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
 
 def _weights(weigher: _Weigher, paths: Paths) -> Array:
     """(ray, w)"""
-    each = _product(paths.sums, weigher.walked) + weigher.log_share[None]
-    return _wanted(weigher, paths, jax.nn.logsumexp(each, axis=1))
+    return _wanted(weigher, paths, _mixed(weigher, paths)[0])
+
+
+def _mixed(weigher: _Weigher, paths: Paths) -> tuple[Array, Array]:
+    """(ray,), the logarithm of the density of each path under all columns together; and (ray, k),
+    what each column has of it."""
+    each = _walked(weigher, paths) + weigher.log_share[None]
+    largest = jnp.max(each, axis=1)
+    each = jnp.exp(each - largest[:, None])
+    total = jnp.sum(each, axis=1)
+    return largest + jnp.log(total), each / total[:, None]
+
+
+def _walked(weigher: _Weigher, paths: Paths) -> Array:
+    """(ray, k): logarithm of the density of each path under each column."""
+    each = _product(paths.sums, weigher.walked)
+    if weigher.ends is None:
+        return each
+    return each + _product(_of(paths.end, ENDS, each.dtype), weigher.ends)
 
 
 def _wanted(weigher: _Weigher, paths: Paths, unit: Array) -> Array:
@@ -170,45 +197,153 @@ def _group(rays: int) -> int:
     return min(GROUP, 1 << max((rays // GROUPS).bit_length() - 1, 0))
 
 
+class _Sums(NamedTuple):
+    """Sums over the rays of each fold (f) and its groups: the rays, the weights (w) and their
+    squares; what each column (k) has of the paths' densities beyond its share; and products of the
+    sums of a group, over its rays. At last, where slopes are asked for, of sums along paths times
+    weights."""
+
+    rays: Float[Array, "f"]
+    weight: Float[Array, "f w"]
+    weight2: Float[Array, "f w"]
+    squares: Float[Array, "f w"]
+    beyond: Float[Array, "f k"]
+    beyond2: Float[Array, "f k k"]
+    cross: Float[Array, "f k w"]
+    by_sum: Float[Array, "18 w"] | None
+
+
 @jax.custom_jvp
 def _sum_weights(weigher: _Weigher, paths: Paths, sent: Array) -> tuple[Array, Array, Array]:
     """(w,) sums of the weights, of their squares, and of the squares of groups over their rays."""
-    return _moments(weigher, paths, sent)[:3]
-
-
-def _moments(weigher: _Weigher, paths: Paths, sent: Array, sums: bool = False):
-    width, dtype = weigher.asked.shape[1], weigher.asked.dtype
-    group = _group(paths.hero.shape[0])
-    chunks = _chunks(paths, group)
-    number, size = chunks.hero.shape
-    first = jnp.arange(number * size // group, dtype=sent.dtype).reshape(number, -1) * group
-    # groups beyond the last ray that set out are empty
-    each = jnp.clip(sent - first, 1, group).astype(dtype)
-
-    def part(i, carry):
-        lot, rays = jax.tree.map(lambda chunk: chunk[i], (chunks, each))
-        weight = _weights(weigher, lot)
-        grouped = jnp.sum(weight.reshape(-1, group, width), axis=1)
-        w, w2, squares, by_sum = carry
-        if sums:
-            by_sum = by_sum + _product(lot.sums.T, weight)
-        w, w2 = w + jnp.sum(grouped, axis=0), w2 + jnp.sum(weight**2, axis=0)
-        return w, w2, squares + jnp.sum(grouped**2 / rays[:, None], axis=0), by_sum
-
-    zero = jnp.zeros((SUMS if sums else 0, width), dtype)
-    none = jnp.zeros(width, dtype)
-    # what did not set out is not looked at
-    return jax.lax.fori_loop(0, (sent + size - 1) // size, part, (none, none, none, zero))
+    return _steadied(_sums(weigher, paths, sent))
 
 
 @_sum_weights.defjvp
 def _(primals, tangents):
     # The derivative of a weight is the weight times the sums along its path: their means serve
     # every parameter at once.
-    weight, weight2, squares, mean_sums = _moments(*primals, sums=True)
-    slope = jnp.sum(mean_sums * tangents[0].asked, axis=0)
+    sums = _sums(*primals, slopes=True)
+    slope = jnp.sum(sums.by_sum * tangents[0].asked, axis=0)
+    weight, weight2, squares = _steadied(sums)
     none = jnp.zeros_like(weight2)
     return (weight, weight2, squares), (slope.astype(weight.dtype), none, none)
+
+
+def _sums(weigher: _Weigher, paths: Paths, sent: Array, slopes: bool = False) -> _Sums:
+    width, dtype = weigher.asked.shape[1], weigher.asked.dtype
+    group = _group(paths.hero.shape[0])
+    chunks = _chunks(paths, group)
+    size = chunks.hero.shape[1]
+    folds, known = (1, 0) if weigher.ends is None else (FOLDS, weigher.walked.shape[1])
+    # what did not set out is not looked at
+    used = (sent + size - 1) // size
+
+    def grouped(x):
+        return jnp.sum(x.reshape(size // group, group, *x.shape[1:]), axis=1)
+
+    def lot(i):
+        chunk = jax.tree.map(lambda part: part[i], chunks)
+        log, shares = _mixed(weigher, chunk)
+        set_out = (i * size + jnp.arange(size, dtype=used.dtype) < sent).astype(dtype)
+        beyond = set_out[:, None] * (shares - jnp.exp(weigher.log_share)[None])
+        return chunk, log, grouped(set_out), grouped(beyond[:, :known])
+
+    def over(part, zero):
+        """The sums of `part` over the chunks of each fold."""
+
+        def fold(f):
+            low, high = f * used // folds, (f + 1) * used // folds
+            return jax.lax.fori_loop(low, high, partial(part, f), zero)
+
+        return jax.lax.map(fold, jnp.arange(folds, dtype=used.dtype))
+
+    def zeros(*shape):
+        return jnp.zeros(shape, dtype)
+
+    factor = None
+    if slopes and known:
+
+        def of_columns(f, i, carry):
+            rays, beyond, beyond2 = carry
+            _, _, count, c = lot(i)
+            scaled = c / jnp.maximum(count, 1.0)[:, None]
+            return rays + jnp.sum(count), beyond + jnp.sum(c, axis=0), beyond2 + c.T @ scaled
+
+        found = over(of_columns, (zeros(), zeros(known), zeros(known, known)))
+        factor = _factors(*found)
+
+    def part(f, i, carry):
+        chunk, log, count, c = lot(i)
+        weight = _wanted(weigher, chunk, log)
+        w = grouped(weight)
+        inverse = 1.0 / jnp.maximum(count, 1.0)[:, None]
+        scaled = c * inverse
+        by_sum = carry.by_sum
+        if by_sum is not None:
+            counts = weight
+            if factor is not None:
+                level, tilt = factor
+                counts = weight * jnp.repeat(level[f] - scaled @ tilt[f], group)[:, None]
+            by_sum = by_sum + _product(chunk.sums.T, counts)
+        return _Sums(
+            carry.rays + jnp.sum(count),
+            carry.weight + jnp.sum(w, axis=0),
+            carry.weight2 + jnp.sum(weight**2, axis=0),
+            carry.squares + jnp.sum(w**2 * inverse, axis=0),
+            carry.beyond + jnp.sum(c, axis=0),
+            carry.beyond2 + _product(c.T, scaled),
+            carry.cross + _product(scaled.T, w),
+            by_sum,
+        )
+
+    zero = _Sums(
+        zeros(), zeros(width), zeros(width), zeros(width), zeros(known), zeros(known, known),
+        zeros(known, width), zeros(SUMS, width) if slopes else None,
+    )  # fmt: skip
+    found = over(part, zero)
+    return found if found.by_sum is None else found._replace(by_sum=jnp.sum(found.by_sum, axis=0))
+
+
+def _others(x: Array) -> Array:
+    """Of each fold, what all the others have."""
+    return jnp.sum(x, axis=0, keepdims=True) - x
+
+
+def _inverses(rays: Array, beyond2: Array) -> Array:
+    """(f, k, k) of the moments that the other folds have; nothing where they have few rays."""
+    moments = _others(beyond2)
+    own = jnp.diagonal(moments, axis1=1, axis2=2)
+    ridge = RIDGE * own + TINY * jnp.max(own, axis=1, keepdims=True) + TINY
+    moments = moments + jax.vmap(jnp.diag)(ridge)
+    inverse = jax.vmap(lambda a: jax.scipy.linalg.cho_solve(
+        jax.scipy.linalg.cho_factor(a), jnp.eye(len(a), dtype=a.dtype)
+    ))(moments)  # fmt: skip
+    return jnp.where((_others(rays) >= ENOUGH)[:, None, None], inverse, 0.0)
+
+
+def _steadied(sums: _Sums) -> tuple[Array, Array, Array]:
+    """Weights, their squares and those of groups, with what `_controls` takes off."""
+    weight, squares = (jnp.sum(x, axis=0) for x in (sums.weight, sums.squares))
+    weight2 = jnp.sum(sums.weight2, axis=0)
+    if not sums.beyond.shape[1]:
+        return weight, weight2, squares
+    rays, beyond, light, cross = (
+        _others(x) for x in (sums.rays, sums.beyond, sums.weight, sums.cross)
+    )
+    cross = cross - beyond[..., None] * (light / jnp.maximum(rays, 1.0)[:, None])[:, None]
+    controls = jnp.matmul(_inverses(sums.rays, sums.beyond2), cross, precision="highest")
+    weight = weight - jnp.einsum("fk,fkw->w", sums.beyond, controls, precision="highest")
+    twice = jnp.matmul(sums.beyond2, controls, precision="highest") - 2.0 * sums.cross
+    return weight, weight2, squares + jnp.sum(twice * controls, axis=(0, 1))
+
+
+def _factors(rays: Array, beyond: Array, beyond2: Array) -> tuple[Array, Array]:
+    """What the weights of a group count in `_steadied`'s sum, which is linear in them: for each
+    fold (f,), less (f, k) times what the columns have beyond their shares, by ray."""
+    tilt = jnp.einsum("fkl,fl->fk", _inverses(rays, beyond2), beyond, precision="highest")
+    level = jnp.sum(tilt * _others(beyond), axis=1) / jnp.maximum(_others(rays), 1.0)
+    return 1.0 + _others(level), _others(tilt)
 
 
 @partial(jax.jit, static_argnames=("own_only",))
@@ -228,9 +363,16 @@ def collect(
     and so `mean`, is differentiable in the coefficients of `asked`; the errors are not. `own_only`
     shares no path among columns, as it must be where the refractive index depends on the
     wavelength: `asked` then has the columns of `walked`.
+
+    The densities of all paths under a column of a plan, over those under all columns together, have
+    the mean 1, whatever the column is. Where many rays share a plan, what they are above it in the
+    sample tells how much more light comes back there than should, and that is taken off (control
+    variates of mixtures, Owen and Zhou 2000, doi 10.1080/01621459.2000.10473909). How much it is,
+    every eighth of the rays (`FOLDS`) is told by the others, so that nothing is biased.
     """
-    weigher = _weigher(walked, asked, absorb, shares, own_only)
     rays, columns = paths.hero.shape[0], walked.mu_a.shape[1]
+    many = shares is not None and not own_only and rays - rays // FOLDS >= ENOUGH
+    weigher = _weigher(walked, asked, absorb, shares, own_only, ended=many)
     sent = jnp.asarray(rays if sent is None else sent, jnp.int32)
     total = sent.astype(weigher.asked.dtype)
     if not own_only:
@@ -251,39 +393,51 @@ def improve(paths: Paths, plan: Plan, asked: Layers, rays: int = PILOT) -> Plan:
 
     From a pilot, the `paths` of that plan, of which it looks at the first `rays`.
     """
-    step = -(-asked.theta_0.shape[0] // 256)
+    step = -(-asked.theta_0.shape[0] // WATCHED)
     every = {
         name: getattr(asked, name)[..., ::step]
         for name in Layers._fields
         if name not in ("thickness", "bottom", "roughness")
     }
     pilot = Paths(*(part[:rays] for part in paths))
-    shares = _improve(pilot, plan.layers, asked._replace(**every), plan.shares)
-    return plan._replace(shares=shares)
+    asked = asked._replace(**every)
+    return plan._replace(shares=_improve(pilot, plan.layers, asked, plan.shares))
 
 
 @jax.jit
 def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> Array:
-    weigher = _weigher(walked, asked, 1.0, shares)
-    each = _product(paths.sums, weigher.walked)
+    weigher = _weigher(walked, asked, 1.0, shares, ended=True)
+    each = _walked(weigher, paths)
     largest = jnp.max(each, axis=1)
-    density = jnp.exp(each - largest[:, None])
+    density = jnp.exp(each - largest[:, None]) * jnp.sign(shares)[None]
     wanted = _wanted(weigher, paths, largest)
     sent = _of(paths.hero, len(shares), density.dtype)
     mean_of = sent / jnp.maximum(jnp.sum(sent, axis=0, keepdims=True), 1.0)
 
+    def about_mean(x):
+        return x - _product(sent, _product(mean_of.T, x))
+
+    def rest(now):
+        """What each ray counts, and what its weights are off by, as far as no column tells it."""
+        ray, mixed = _product(mean_of, now), _product(density, now)[:, None]
+        known, weight = about_mean(density / mixed), about_mean(wanted / mixed)
+        moments = _product(known.T, ray[:, None] * known)
+        moments = moments + jnp.diag(RIDGE * jnp.diag(moments) + TINY)
+        factor = jax.scipy.linalg.cho_factor(moments)
+        told = jax.scipy.linalg.cho_solve(factor, _product(known.T, ray[:, None] * weight))
+        return ray, weight - _product(known, told)
+
     def better(_, state):
         now, best, least = state
-        mixed = _product(density, now)
-        weight = wanted / mixed[:, None]
-        scatter = (weight - _product(sent, _product(mean_of.T, weight))) ** 2
-        ray = _product(mean_of, now)
+        ray, off = rest(now)
+        scatter = off**2
         error = _product(ray, scatter)
         largest = jnp.max(error)
         best = jnp.where(largest < least, now, best)
         # the largest errors lead: the gradient of a high power mean, in damped steps
         lead = (error / largest) ** 8
-        borne = _product((ray * _product(scatter, lead) / mixed), density)
+        borne = ray * _product(scatter, lead) / _product(density, now)
+        borne = _product(borne, density)
         new = now * (borne / jnp.sum(borne * now)) ** 0.2
         # never nothing: what the pilot missed would weigh without a bound
         new = jnp.maximum(new, 0.2 * shares)
@@ -339,7 +493,7 @@ def moments(
     asked: Layers | None = None,
     shares: Float[Array, "k"] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (w,) as `collect` gives it, and the covariance (w, w) of its error between wavelengths.
+    """Mean (w,) of the weights, and the covariance (w, w) of its error between wavelengths.
 
     `asked` are the layers `walked` if not given.
     """

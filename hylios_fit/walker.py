@@ -15,7 +15,7 @@ Two things differ from the letter of the paper (`analog`):
 - Where theta_0 falls from 5 degrees to 0 (780 to 1300 nm), rays of a `plan` walk with the angles
   of `NODES`, and the reflectance is interpolated between them (`node_shares`): long paths that bend
   a little differently could not serve each other otherwise. This changes the reflectance by at most
-  0.0009 in S4 and 0.0001 in S1 to S3 (`adding` with those angles and with the one between them).
+  0.0007 in S4 and 0.0001 in S1 to S3 (`adding` with those angles and with the one between them).
   Shares of the light that may not be negative (`tally.collect_bins`) are on straight lines between
   two of them, and are changed by 0.002 of the light in S4 and 0.0004 in S1.
   Where every wavelength has a column of its own, it also has its own angle.
@@ -37,15 +37,18 @@ from hylios_fit.skin import LAYERS, STRATA, Layers
 
 # What is summed along a path, in this order
 LENGTH = slice(0, 6)  # path length in each layer, cm
-HITS = slice(6, 9)  # melanosomes or complexes hit in each stratum
+HITS = slice(6, 9)  # melanosomes or complexes hit in each stratum, and survived
 PROPOSED = slice(9, 12)  # the same before rejections
 FIBRE, FIBRE_LENGTH, TISSUE, BOTTOM = range(12, 16)
 BENT, STRAIGHT = 16, 17  # sum of the angles of the hits; 1 if there were hits and none bent
 SUMS = 18
+# What ends a ray inside: its layer, a hit in a stratum, the bottom
+ABSORBED, BY_HIT, AT_BOTTOM, ENDS = 1, 7, 10, 11
 
 NODES = scattering.LATIMER_ANGLE * np.sqrt(
     [0.0, 0.008, 0.03, 0.075, 0.14, 0.235, 0.36, 0.53, 0.74, 1.0]
 )
+FAR = 0.006  # and nodes that would weigh no more than this, 2.3 gaps away, count nothing
 EASE = 0.002  # added to squares of angles, over the largest, in whose logarithm reflectance is even
 DRAWS = 11  # random numbers that a step may take
 ROUND = 16  # steps between two exchanges of rays that ended
@@ -59,11 +62,13 @@ class Paths(NamedTuple):
     sums: what adds up along each path (`LENGTH`, `HITS`, ...); zero weight where `escaped` is 0.
     escaped: 1 out above, -1 out below the last layer walked, 0 ended inside.
     hero: column of the layers that each ray walked for.
+    end: what ended each ray inside, a row of `end_density`; 0 if nothing did.
     """
 
     sums: Float[Array, "ray 18"]
     escaped: Float[Array, "ray"]
     hero: Int[Array, "ray"]
+    end: Int[Array, "ray"]
 
 
 class Exits(NamedTuple):
@@ -147,8 +152,9 @@ COMPILED = {
     "xla_cpu_fast_math_honor_functions": True,
 }
 
-FLYING, AGAIN, WAITING, ENDED, ABOVE, BELOW = range(6)
-"""Phase of a ray: on its way; to draw its scattering angle again; at an interface; over."""
+FLYING, AGAIN, WAITING, ABOVE, BELOW, ENDED = range(6)
+"""Phase of a ray: on its way; to draw its scattering angle again; at an interface; out above, or
+below; over inside, plus the row of `end_density` that says by what."""
 
 
 class _Lane(NamedTuple):
@@ -385,13 +391,15 @@ def _step(
     top = u[2] > 0
     depth = jnp.where(done, jnp.where(top, 0.0, _thickness(m, layer, hero)), depth)
 
-    happened = [hit & (lane.layer == i) for i in (1, 2, 3)]
+    happened = [hit & ~ends & (lane.layer == i) for i in (1, 2, 3)]
     happened += [met & (lane.layer == i) for i in (1, 2, 3)]
     happened += [fibre, tissue, here & bottom]
-    over = lane.phase >= ENDED
+    over = lane.phase >= ABOVE
+    by_medium = ABSORBED + jnp.where(lane.layer == 6, 4, lane.layer)
+    end = jnp.where(absorbed, by_medium, jnp.where(lost, AT_BOTTOM, BY_HIT - 1 + lane.layer))
     phase = jnp.where(bends & ~accepted, AGAIN, FLYING)
     phase = jnp.where(here & ~done, WAITING, phase)
-    phase = jnp.where(ends | lost, ENDED, phase)
+    phase = jnp.where(ends | lost, ENDED + end, phase)
     phase = jnp.where(passes & (layer < 0), ABOVE, phase)
     if below < len(LAYERS) - 1:
         phase = jnp.where(passes & (layer == below + 1), BELOW, phase)
@@ -409,7 +417,7 @@ def _step(
         counts=tuple(
             total + _number(flag, dtype) for flag, total in zip(happened, lane.counts, strict=True)
         ),
-        bent=lane.bent + jnp.where(bends & accepted, theta, 0.0),
+        bent=lane.bent + jnp.where(bends & accepted & ~ends, theta, 0.0),
     )
 
 
@@ -486,7 +494,7 @@ def _walk(
     )  # fmt: skip
 
     def round_(state):
-        step, lane, place, sums, escaped, left, upcoming = state
+        step, lane, place, sums, escaped, end, left, upcoming = state
         ray = order[jnp.clip(place, 0, rays - 1)]
         hero = heroes[ray]
         theta_0 = medium.theta_0[hero]
@@ -497,12 +505,13 @@ def _walk(
             return step, _step(lane, medium, hero, theta_0, step, spheroid, below)
 
         step, lane = jax.lax.fori_loop(0, round_length, one, (step, lane))
-        ended = (lane.phase >= ENDED) & (place < sent)
+        ended = (lane.phase >= ABOVE) & (place < sent)
         # out-of-range places are dropped: each ray is written once, when it ends
         target = jnp.where(ended, ray, rays)
         sums = sums.at[target].set(_sums(lane), mode="drop")
         out = _number(lane.phase == ABOVE, dtype) - _number(lane.phase == BELOW, dtype)
         escaped = escaped.at[target].set(out, mode="drop")
+        end = end.at[target].set(jnp.maximum(lane.phase - ENDED, 0), mode="drop")
         if exits:
             way = jnp.stack((*lane.u, *lane.place), axis=1)
             left = left.at[target].set(way, mode="drop")
@@ -511,7 +520,8 @@ def _walk(
         begins = ended & (place < sent)
         new = fresh(first + order[jnp.clip(place, 0, rays - 1)].astype(jnp.uint32))
         lane = jax.tree.map(lambda n, o: jnp.where(begins, n, o), new, lane)
-        return step, lane, place, sums, escaped, left, upcoming + jnp.sum(ended, dtype=jnp.int32)
+        upcoming = upcoming + jnp.sum(ended, dtype=jnp.int32)
+        return step, lane, place, sums, escaped, end, left, upcoming
 
     place = jnp.arange(lanes, dtype=jnp.int32)
     lane = fresh(first + order[:lanes].astype(jnp.uint32))
@@ -521,13 +531,15 @@ def _walk(
         place,
         jnp.zeros((rays, SUMS), dtype),
         jnp.zeros(rays, dtype),
+        jnp.zeros(rays, jnp.int32),
         jnp.zeros((rays if exits else 0, 5), dtype),
         jnp.asarray(lanes, jnp.int32),
     )
     state = jax.lax.while_loop(
-        lambda s: jnp.any((s[1].phase < ENDED) & (s[2] < sent)), round_, state
+        lambda s: jnp.any((s[1].phase < ABOVE) & (s[2] < sent)), round_, state
     )
-    return Paths(state[3], state[4], heroes), state[5]
+    _, _, _, sums, escaped, end, left, _ = state
+    return Paths(sums, escaped, heroes, end), left
 
 
 def walk(
@@ -635,8 +647,9 @@ def node_shares(theta_0: Float[Array, "w"], positive: bool = False) -> Float[Arr
     """What each of `NODES` counts at each wavelength; at either end its node alone.
 
     The weights, some of them below 0, with the least sum of squares that are exact for parabolas in
-    log(theta^2 + `EASE`), squares of nodes that are a gap away counting e times as much. Or, if
-    `positive`, those of the straight line between the two nodes around.
+    log(theta^2 + `EASE`), squares of nodes that are a gap away counting e times as much. Far ones
+    count nothing (`FAR`): they have no columns for these wavelengths, and a rare path could count
+    hundreds of times. Or, if `positive`, those of the straight line between the two nodes around.
     """
     square, count = NODES[-1] ** 2, len(NODES)
     place = np.log(NODES**2 / square + EASE)
@@ -645,7 +658,7 @@ def node_shares(theta_0: Float[Array, "w"], positive: bool = False) -> Float[Arr
     away = number[:, None] - jnp.interp(asked[0], nodes, number)[None]
     if positive:
         return jnp.maximum(1.0 - jnp.abs(away), 0.0)
-    weight, nodes = jnp.exp(-(away**2)), nodes[:, None]
+    weight, nodes = jnp.maximum(jnp.exp(-(away**2)) - FAR, 0.0), nodes[:, None]
     # polynomials that are orthogonal over the weighted nodes: there (`at`), and where asked (`to`)
     at, to = jnp.ones_like(weight), jnp.ones_like(asked)
     last_at, last_to, last_norm = 0.0 * at, 0.0 * to, 1.0
@@ -811,6 +824,25 @@ def log_density(layers: Layers, absorb: float = 1.0) -> Float[Array, "18 w"]:
             (absorb * log(layers.bottom)) * row,
             0.0 * row,
             0.0 * row,
+        ]
+    )
+
+
+def end_density(layers: Layers, absorb: float = 1.0) -> Float[Array, "11 w"]:
+    """As `log_density`, of what ended a ray inside: nothing, each layer, a hit in each stratum, the
+    bottom. With it the densities of all paths, those that ended as well, add up to 1."""
+
+    def log(x):
+        return jnp.log(jnp.maximum(x, NOTHING**2))
+
+    row = jnp.ones((1, layers.mu_a.shape[1]), layers.mu_a.dtype)
+    kept = layers.bottom**absorb
+    return jnp.concatenate(
+        [
+            0.0 * row,
+            log(absorb * layers.mu_a),
+            log(1.0 - layers.hit_albedo[1:4] ** absorb),
+            (log(1.0 - kept) - log(kept)) * row,  # the bottom is among the sums
         ]
     )
 

@@ -430,6 +430,7 @@ def test_weights_in_single_precision_are_those_in_double(paths, layers, found):
             jnp.asarray(np.asarray(paths.sums), jnp.float64),
             jnp.asarray(np.asarray(paths.escaped), jnp.float64),
             jnp.asarray(np.asarray(paths.hero)),
+            jnp.asarray(np.asarray(paths.end)),
         )
         layers = S3.layers(NM, jnp.float64)
         double = tally.collect(wide, layers, layers)
@@ -481,6 +482,69 @@ def test_a_plan_gives_what_each_wavelengths_own_rays_give_with_a_smaller_error(s
         assert stats.chi2.sf(np.sum(z**2), z.size) > 1e-4
 
 
+def several(plan, key, form="complex", lots=4):
+    """The paths of a few walks that begin where the one before ended."""
+    found = [walk(plan.layers, key, form, first=i * RAYS, shares=plan.shares) for i in range(lots)]
+    return walker.Paths(*(jnp.concatenate(part) for part in zip(*found, strict=True)))
+
+
+@pytest.mark.parametrize(("name", "form"), [("S3", "complex"), ("S4", "dispersed")])
+def test_the_densities_of_all_paths_under_any_column_add_up_to_one(name, form):
+    nm = np.arange(250.0, 2501.0, 50.0)
+    plan = walker.plan(Specimen.preset(name).replace(bottom_reflectance=0.7).layers(nm))
+    paths = several(plan, jax.random.key(24), form)
+    weigher = tally._weigher(plan.layers, plan.layers, 1.0, plan.shares, ended=True)
+    shares = np.asarray(plan.shares, float)
+    density = np.asarray(tally._mixed(weigher, paths)[1], float) / shares
+    error = density.std(axis=0) / math.sqrt(len(density))
+    z = (density.mean(axis=0) - 1.0) / error
+    assert np.all(error < 0.05)
+    assert np.abs(z).max() < 4
+    # every way to end was met, and without what they are the sum is another
+    assert np.all(np.bincount(np.asarray(paths.end), minlength=walker.ENDS)[[0, 1, 4, 5, 9, 10]])
+    bare = np.asarray(tally._mixed(weigher._replace(ends=None), paths)[1], float) / shares
+    assert np.abs((bare.mean(axis=0) - 1.0) / error).max() > 10
+
+
+def test_what_the_columns_tell_makes_errors_smaller_and_changes_no_mean(spectrum):
+    plan = walker.plan(spectrum)
+    steady, error, raw, raw_error = [], [], [], []
+    for number in range(12):
+        paths = several(plan, jax.random.key(40 + number))
+        found = tally.collect(paths, plan.layers, spectrum, shares=plan.shares)
+        steady.append(found.mean)
+        error.append(found.standard_error)
+        mean, covariance = tally.moments(paths, plan.layers, 1.0, spectrum, plan.shares)
+        raw.append(mean)
+        raw_error.append(np.sqrt(np.diag(covariance)))
+    steady, error, raw, raw_error = (np.array(x, float) for x in (steady, error, raw, raw_error))
+    off = steady - raw
+    z = off.mean(axis=0) / (off.std(axis=0, ddof=1) / math.sqrt(len(off)))
+    assert np.abs(z).max() < 6  # of Student's t with 11 degrees of freedom
+    variance = np.mean(error**2, axis=0) / np.mean(raw_error**2, axis=0)
+    nm = np.arange(250.0, 2501.0, 50.0)
+    assert variance.max() < 1.1
+    assert np.mean(variance[(nm > 750) & (nm < 1200)]) < 0.7
+    # the errors are those that repeated walks show
+    scatter = np.var(steady, axis=0, ddof=1) / np.mean(error**2, axis=0)
+    assert 0.7 < scatter.mean() < 1.4
+
+
+def test_slopes_are_of_what_the_columns_leave(spectrum):
+    with jax.enable_x64(True):
+        layers = jax.tree.map(lambda x: jnp.asarray(np.asarray(x, float)), spectrum)
+        plan = walker.plan(layers)
+        paths = several(plan, jax.random.key(25))
+
+        def mean(step):
+            asked = layers._replace(mu_a=layers.mu_a * (1.0 + step))
+            return tally.collect(paths, plan.layers, asked, shares=plan.shares).mean
+
+        _, slope = jax.jvp(mean, (0.0,), (1.0,))
+        difference = (mean(1e-4) - mean(-1e-4)) / 2e-4
+        np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-9)
+
+
 def test_covariance_of_a_plan_has_the_mean_and_the_errors_of_its_tally(spectrum):
     plan = walker.plan(spectrum)
     paths = walk(plan.layers, jax.random.key(23), shares=plan.shares)
@@ -530,6 +594,7 @@ def test_gradients_are_those_of_the_same_paths(name, paths):
             jnp.asarray(np.asarray(paths.sums), jnp.float64),
             jnp.asarray(np.asarray(paths.escaped), jnp.float64),
             jnp.asarray(np.asarray(paths.hero)),
+            jnp.asarray(np.asarray(paths.end)),
         )
         start = S3.replace(bottom_reflectance=0.9)
         walked = start.layers(NM, jnp.float64)
