@@ -65,7 +65,7 @@ FURTHER = {"index_dispersion": (-0.005, 0.035)}
 FIRST = 3e-3
 """Hits in a straight pass that free the light which total reflection keeps in a clear epidermis."""
 LOCAL_HIDDEN = (192, 192, 192)
-LOCAL_STEPS = 40_000
+LOCAL_STEPS = 50_000
 LOCAL_BATCH = 2048
 ALIKE = 100.0  # entries of a walked table whose noise is as good as one: they share paths
 TRUST = 1e-3  # error of the logarithm that rows without noise are learned to, about
@@ -77,10 +77,10 @@ WAYS = 4, 8  # in which each of them is looked at
 LEAST = {True: 0.025, False: 0.003}
 """By how much a step along a usual parameter, or another, changes the logarithm at least."""
 LOOKED_AT = 384  # specimens that say how much it does
-SPECIMENS = 131_072  # of each form, that the local regression answers for
+SPECIMENS = 262_144  # of each form, that the local regression answers for
 COMPONENTS = 80
 HIDDEN = (192, 128, 128)
-STEPS = 120_000
+STEPS = 150_000
 BATCH = 1024
 SEEN, EMPHASIS = (380.0, 720.0), 2.0  # nm; errors count so much more where the eye sees them
 CORNERS = 0.25  # what a specimen from all over the box weighs: the hardest, and few fits are there
@@ -477,7 +477,7 @@ class Local:
         """How what it says of rows (n, P) changes with every parameter."""
         function = _answer(self, names)
         every = jax.jit(jax.vmap(jax.jacfwd(lambda row: function(row[None])[0])))
-        return np.concatenate([every(lot) for lot in _lots(rows, 16)])
+        return np.concatenate([every(lot) for lot in _lots(rows, 2)])
 
 
 @lru_cache(maxsize=4)
@@ -613,8 +613,9 @@ def _along(function: Callable[[Array], Array]) -> Callable[[Array, Array], tuple
     return jax.jit(lambda rows, ways: jax.jvp(function, (rows,), (ways,)))
 
 
-def _lots(rows: np.ndarray, size: int = 64) -> list[Array]:
-    """Rows in lots of one size, but for the last: what they need stays small."""
+def _lots(rows: np.ndarray, size: int = 8) -> list[Array]:
+    """Rows in lots of one size, but for the last: what they need is so small that it is not asked
+    of the system anew each time, which took as long as the work."""
     return [jnp.asarray(rows[i : i + size], jnp.float32) for i in range(0, len(rows), size)]
 
 
