@@ -29,7 +29,7 @@ from hylios_fit.walker import (
     node_shares,
 )
 
-CHUNK = 64  # rays at a time, so that memory does not depend on their number
+CHUNK, ACCELERATOR_CHUNK = 64, 8192  # rays at a time: memory does not depend on their number
 GROUP = 64  # rays whose sum counts as one for the errors: columns take turns within it
 GROUPS = 256  # no fewer, or what they say of the errors is noise
 PILOT = 2048  # rays that `improve` looks at
@@ -180,7 +180,8 @@ def _sum_own_weights(weigher: _Weigher, paths: Paths, columns: int) -> tuple[Arr
 def _chunks(paths: Paths, group: int = 1) -> Paths:
     """The rays by `CHUNK`, whole groups; what fills the last one never came out."""
     rays = paths.hero.shape[0]
-    size = min(CHUNK, rays + -rays % group)
+    most = CHUNK if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK
+    size = min(most, rays + -rays % group)
     padding = -rays % size
     return Paths(
         *(
@@ -242,7 +243,9 @@ def _sums(weigher: _Weigher, paths: Paths, sent: Array, slopes: bool = False) ->
     def grouped(x):
         return jnp.sum(x.reshape(size // group, group, *x.shape[1:]), axis=1)
 
-    def lot(i):
+    def look(i):
+        """A chunk; the logarithm of its densities; of each group, how many set out and (k) what
+        the columns have beyond their shares."""
         chunk = jax.tree.map(lambda part: part[i], chunks)
         log, shares = _mixed(weigher, chunk)
         set_out = (i * size + jnp.arange(size, dtype=used.dtype) < sent).astype(dtype)
@@ -266,15 +269,19 @@ def _sums(weigher: _Weigher, paths: Paths, sent: Array, slopes: bool = False) ->
 
         def of_columns(f, i, carry):
             rays, beyond, beyond2 = carry
-            _, _, count, c = lot(i)
+            _, _, count, c = look(i)
             scaled = c / jnp.maximum(count, 1.0)[:, None]
-            return rays + jnp.sum(count), beyond + jnp.sum(c, axis=0), beyond2 + c.T @ scaled
+            return (
+                rays + jnp.sum(count),
+                beyond + jnp.sum(c, axis=0),
+                beyond2 + _product(c.T, scaled),
+            )
 
         found = over(of_columns, (zeros(), zeros(known), zeros(known, known)))
         factor = _factors(*found)
 
     def part(f, i, carry):
-        chunk, log, count, c = lot(i)
+        chunk, log, count, c = look(i)
         weight = _wanted(weigher, chunk, log)
         w = grouped(weight)
         inverse = 1.0 / jnp.maximum(count, 1.0)[:, None]
@@ -323,7 +330,8 @@ def _inverses(rays: Array, beyond2: Array) -> Array:
 
 
 def _steadied(sums: _Sums) -> tuple[Array, Array, Array]:
-    """Weights, their squares and those of groups, with what `_controls` takes off."""
+    """(w,) sums of the weights, of their squares, and of those of groups, after what the columns
+    tell is taken off: of each fold as much as goes with it in the others."""
     weight, squares = (jnp.sum(x, axis=0) for x in (sums.weight, sums.squares))
     weight2 = jnp.sum(sums.weight2, axis=0)
     if not sums.beyond.shape[1]:
@@ -339,7 +347,7 @@ def _steadied(sums: _Sums) -> tuple[Array, Array, Array]:
 
 
 def _factors(rays: Array, beyond: Array, beyond2: Array) -> tuple[Array, Array]:
-    """What the weights of a group count in `_steadied`'s sum, which is linear in them: for each
+    """What the weights of a group count in `_steadied`'s sum, which is linear in them: so much by
     fold (f,), less (f, k) times what the columns have beyond their shares, by ray."""
     tilt = jnp.einsum("fkl,fl->fk", _inverses(rays, beyond2), beyond, precision="highest")
     level = jnp.sum(tilt * _others(beyond), axis=1) / jnp.maximum(_others(rays), 1.0)

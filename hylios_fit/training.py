@@ -65,7 +65,7 @@ FURTHER = {"index_dispersion": (-0.005, 0.035)}
 FIRST = 3e-3
 """Hits in a straight pass that free the light which total reflection keeps in a clear epidermis."""
 LOCAL_HIDDEN = (192, 192, 192)
-LOCAL_STEPS = 50_000
+LOCAL_STEPS = 40_000
 LOCAL_BATCH = 2048
 ALIKE = 100.0  # entries of a walked table whose noise is as good as one: they share paths
 TRUST = 1e-3  # error of the logarithm that rows without noise are learned to, about
@@ -77,10 +77,10 @@ WAYS = 4, 8  # in which each of them is looked at
 LEAST = {True: 0.025, False: 0.003}
 """By how much a step along a usual parameter, or another, changes the logarithm at least."""
 LOOKED_AT = 384  # specimens that say how much it does
-SPECIMENS = 262_144  # of each form, that the local regression answers for
+SPECIMENS = 131_072  # of each form, that the local regression answers for
 COMPONENTS = 80
 HIDDEN = (192, 128, 128)
-STEPS = 150_000
+STEPS = 120_000
 BATCH = 1024
 SEEN, EMPHASIS = (380.0, 720.0), 2.0  # nm; errors count so much more where the eye sees them
 CORNERS = 0.25  # what a specimen from all over the box weighs: the hardest, and few fits are there
