@@ -138,9 +138,10 @@ def _parts(specimen: Specimen, nm: np.ndarray, key: jax.Array, repeats: int) -> 
         )
 
     walking, paths = _median(walk, repeats)
-    summing, _ = _median(
+    summing, found = _median(
         lambda: tally.collect(paths, plan.layers, medium, shares=plan.shares), repeats
     )
+    _, covariance = tally.moments(paths, plan.layers, 1.0, medium, plan.shares)
     improving, _ = _median(lambda: tally.improve(paths, plan, medium), repeats)
 
     @jax.jit
@@ -164,6 +165,10 @@ def _parts(specimen: Specimen, nm: np.ndarray, key: jax.Array, repeats: int) -> 
         "improve_seconds": _shared.significant(improving, 3),
         "walk_seconds": _shared.significant(walking, 3),
         "collect_seconds": _shared.significant(summing, 3),
+        # of the errors, after what the densities under all columns tell is taken off
+        "variance_left": _shared.significant(
+            np.asarray(found.standard_error, float) ** 2 / np.maximum(np.diag(covariance), 1e-30), 3
+        ),
         "rays_per_core_second": _shared.significant(rays / (walking + summing), 3),
         # scattering, refused particles and visits to the bottom; interfaces come on top
         "events_per_ray": _shared.significant(events, 3),

@@ -88,7 +88,7 @@ def run(seed: int = 0, specimens: int = SPECIMENS, progress: bool = True) -> dic
                 "rms_difference": float(np.sqrt(np.mean(difference**2))),
                 "largest_difference": float(np.abs(difference).max()),
             }  # fmt: skip
-        result[kind] = found
+        result[kind] = found | {"told": _told([p[f"{kind}_told"] for p in parts])}
     every = {
         name: np.concatenate([p[name] for p in parts]) for name in parts[0] if parts[0][name].ndim
     }
@@ -108,6 +108,19 @@ def run(seed: int = 0, specimens: int = SPECIMENS, progress: bool = True) -> dic
     return result
 
 
+def _told(parts: list[np.ndarray]) -> dict[str, float]:
+    """Of the means after what the columns tell is taken off, as `simulate` gives them, the mean
+    square in their standard errors: 1 if they are right. Its own error from specimens, whose
+    wavelengths share paths."""
+    squares = np.array([np.mean(z[np.isfinite(z)] ** 2) for z in parts if np.isfinite(z).any()])
+    return {
+        "mean_square_z": _shared.significant(squares.mean(), 4),
+        "error": _shared.significant(squares.std(ddof=1) / np.sqrt(len(squares)), 3),
+        "largest_z": _shared.significant(np.nanmax(np.abs(np.concatenate(parts))), 4),
+        "specimens": len(squares),
+    }
+
+
 def _one(number: int, seed: int) -> dict[str, Any]:
     specimen, nm = specimen_of(number, seed)
     layers = specimen.layers(nm)
@@ -119,8 +132,10 @@ def _one(number: int, seed: int) -> dict[str, Any]:
         solution = adding.skin(medium, order=ORDER)
         surface = np.asarray(solution.surface, float)
         exact[kind] = np.asarray(solution.reflectance, float)
-        mean, covariance, effective = _walked(specimen, layers, key, independent)
-        difference = (1 - surface) * mean - np.asarray(solution.subsurface, float)
+        mean, covariance, total, own = _walked(specimen, layers, key, independent)
+        inside = np.asarray(solution.subsurface, float)
+        difference = (1 - surface) * mean - inside
+        effective = np.asarray(total.effective_rays)
         covariance = covariance * np.outer(1 - surface, 1 - surface)
         error = np.sqrt(np.diag(covariance))
         enough = (effective > ENOUGH) & (error > 0)
@@ -128,7 +143,11 @@ def _one(number: int, seed: int) -> dict[str, Any]:
         size, vectors = np.linalg.eigh(covariance[np.ix_(enough, enough)])
         kept = size > 1e-3 * size.max(initial=0.0)
         along = vectors[:, kept].T @ difference[enough]
+        told = (1 - surface) * np.asarray(total.mean, float) - inside
+        spread = (1 - surface) * np.asarray(total.standard_error, float)
+        use = enough & (not own)
         found |= {
+            f"{kind}_told": np.where(use, told / np.where(use, spread, 1.0), np.nan),
             f"{kind}_difference": difference,
             f"{kind}_z": np.where(enough, difference / np.where(error > 0, error, 1.0), np.nan),
             f"{kind}_chi2": np.sum(along**2 / size[kept]),
@@ -149,9 +168,9 @@ def _walked(specimen: Specimen, layers: Any, key: jax.Array, independent: bool):
     total = tally.collect(paths, plan.layers, layers, own_only=own, shares=plan.shares)
     if own:
         covariance = np.diag(np.asarray(total.standard_error, float) ** 2)
-        return np.asarray(total.mean, float), covariance, np.asarray(total.effective_rays)
+        return np.asarray(total.mean, float), covariance, total, own
     mean, covariance = tally.moments(paths, plan.layers, 1.0, layers, plan.shares)
-    return mean, covariance, np.asarray(total.effective_rays)
+    return mean, covariance, total, own
 
 
 def draw(result: Mapping[str, Any], path: Any) -> None:
