@@ -69,8 +69,11 @@ def features(
         found = jax.vmap(lambda row: features(names, form, row))(rows)
         return found.reshape(*parameters.shape[:-1], -1)
     at = {name: parameters[i] for i, name in enumerate(names)}
-    own = [jnp.log(x + OFFSETS[name]) if name in OFFSETS else x for name, x in at.items()]
-    own += [at[name] / (at[name] + FIRST) for name in at if name.startswith("melanosome_")]
+    # all at once: one parameter at a time is as many small steps, which take longer than the rest
+    offsets = np.array([OFFSETS.get(name, 1.0) for name in names], parameters.dtype)
+    logged = np.array([name in OFFSETS for name in names])
+    own = jnp.where(logged, jnp.log(parameters + offsets), parameters)
+    contents = jnp.stack([x for name, x in at.items() if name.startswith("melanosome_")])
     v = {**Specimen().values, **at}
     v = {name: jnp.asarray(value, parameters.dtype) for name, value in v.items()}
     melanin = skin.melanin_coefficient(v, FEATURES_NM, parameters.dtype)
@@ -83,7 +86,7 @@ def features(
     depths = {layer: mu * v[f"thickness_{layer}"] for layer, mu in mu_a.items()}
     epidermis = sum(depths[layer] for layer in LAYERS[:4])
     logs = [jnp.log(depth + FAINT) for depth in (epidermis, *(depths[n] for n in LAYERS[4:]))]
-    return jnp.concatenate([jnp.stack(own), *logs])
+    return jnp.concatenate([own, contents / (contents + FIRST), *logs])
 
 
 class Member(eqx.Module):
