@@ -462,7 +462,8 @@ def collect_bins(
     """Sums of the weights, and of their squares, of the rays in each bin.
 
     `place` (ray,) is the bin of each ray, -1 for none. Their sum over all bins is `collect`'s, but
-    where that has weights below 0 (`walker.node_shares`): here none is, as no bin may be.
+    where that has weights below 0 (`walker.node_shares`), as no bin may have, and for what it takes
+    off.
     """
     weigher = _weigher(plan.layers, asked, 1.0, plan.shares, own_only, positive=True)
 
