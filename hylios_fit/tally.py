@@ -41,7 +41,7 @@ RIDGE = 0.05  # of the second moment of what is known, so that its scatter is no
 
 
 class Tally(NamedTuple):
-    """Sums over rays that entered the skin; w wavelengths.
+    """Sums over rays that entered the skin, less what the columns tell (`collect`); w wavelengths.
 
     `squares` has the squared sum of the weights of each group of rays, over their number: columns
     take turns among the rays, so that only the scatter between groups is error. `groups` is their
@@ -178,7 +178,8 @@ def _sum_own_weights(weigher: _Weigher, paths: Paths, columns: int) -> tuple[Arr
 
 
 def _chunks(paths: Paths, group: int = 1) -> Paths:
-    """The rays by `CHUNK`, whole groups; what fills the last one never came out."""
+    """The rays by `CHUNK` or `ACCELERATOR_CHUNK`, whole groups; what fills the last one never came
+    out."""
     rays = paths.hero.shape[0]
     most = CHUNK if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK
     size = min(most, rays + -rays % group)
@@ -201,8 +202,8 @@ def _group(rays: int) -> int:
 class _Sums(NamedTuple):
     """Sums over the rays of each fold (f) and its groups: the rays, the weights (w) and their
     squares; what each column (k) has of the paths' densities beyond its share; and products of the
-    sums of a group, over its rays. At last, where slopes are asked for, of sums along paths times
-    weights."""
+    sums of a group, over its rays. At last, where slopes are asked for and over all folds, of sums
+    along paths times what their weights count."""
 
     rays: Float[Array, "f"]
     weight: Float[Array, "f w"]
@@ -291,7 +292,7 @@ def _sums(weigher: _Weigher, paths: Paths, sent: Array, slopes: bool = False) ->
             counts = weight
             if factor is not None:
                 level, tilt = factor
-                counts = weight * jnp.repeat(level[f] - scaled @ tilt[f], group)[:, None]
+                counts = weight * jnp.repeat(level[f] - _product(scaled, tilt[f]), group)[:, None]
             by_sum = by_sum + _product(chunk.sums.T, counts)
         return _Sums(
             carry.rays + jnp.sum(count),
@@ -331,7 +332,8 @@ def _inverses(rays: Array, beyond2: Array) -> Array:
 
 def _steadied(sums: _Sums) -> tuple[Array, Array, Array]:
     """(w,) sums of the weights, of their squares, and of those of groups, after what the columns
-    tell is taken off: of each fold as much as goes with it in the others."""
+    tell is taken off the first and the last: of each fold as much as goes with it in the others.
+    """
     weight, squares = (jnp.sum(x, axis=0) for x in (sums.weight, sums.squares))
     weight2 = jnp.sum(sums.weight2, axis=0)
     if not sums.beyond.shape[1]:
@@ -376,7 +378,8 @@ def collect(
     the mean 1, whatever the column is. Where many rays share a plan, what they are above it in the
     sample tells how much more light comes back there than should, and that is taken off (control
     variates of mixtures, Owen and Zhou 2000, doi 10.1080/01621459.2000.10473909). How much it is,
-    every eighth of the rays (`FOLDS`) is told by the others, so that nothing is biased.
+    every eighth of the rays (`FOLDS`) is told by the others, so that it biases nothing; where
+    hardly any light comes back the mean may fall below 0, within its error.
     """
     rays, columns = paths.hero.shape[0], walked.mu_a.shape[1]
     many = shares is not None and not own_only and rays - rays // FOLDS >= ENOUGH

@@ -57,9 +57,9 @@ BATCH, ACCELERATOR_BATCH = 65_536, 1 << 19  # rays of one compiled call (`batch_
 
 
 class Paths(NamedTuple):
-    """Rays that came back out, and how many set out.
+    """How the rays ended, and what they met until then.
 
-    sums: what adds up along each path (`LENGTH`, `HITS`, ...); zero weight where `escaped` is 0.
+    sums: what adds up along each path (`LENGTH`, `HITS`, ...), also of rays that ended inside.
     escaped: 1 out above, -1 out below the last layer walked, 0 ended inside.
     hero: column of the layers that each ray walked for.
     end: what ended each ray inside, a row of `end_density`; 0 if nothing did.
