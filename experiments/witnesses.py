@@ -167,9 +167,10 @@ def _walked(specimen: Specimen, layers: Any, key: jax.Array, independent: bool):
     )  # fmt: skip
     total = tally.collect(paths, plan.layers, layers, own_only=own, shares=plan.shares)
     if own:
+        mean = np.asarray(total.mean, float)
         covariance = np.diag(np.asarray(total.standard_error, float) ** 2)
-        return np.asarray(total.mean, float), covariance, total, own
-    mean, covariance = tally.moments(paths, plan.layers, 1.0, layers, plan.shares)
+    else:
+        mean, covariance = tally.moments(paths, plan.layers, 1.0, layers, plan.shares)
     return mean, covariance, total, own
 
 

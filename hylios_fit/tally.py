@@ -34,7 +34,7 @@ GROUP = 64  # rays whose sum counts as one for the errors: columns take turns wi
 GROUPS = 256  # no fewer, or what they say of the errors is noise
 PILOT = 2048  # rays that `improve` looks at
 WATCHED = 128  # wavelengths whose errors shares are chosen by
-TINY = 1e-9
+TINY = 1e-9  # and at least this, where no ray knows a column
 FOLDS = 8  # of the rays of a sum: what each takes off the others say
 ENOUGH = 16_384  # rays that say it
 RIDGE = 0.05  # of the second moment of what is known, so that its scatter is not learned
@@ -265,18 +265,17 @@ def _sums(weigher: _Weigher, paths: Paths, sent: Array, slopes: bool = False) ->
     def zeros(*shape):
         return jnp.zeros(shape, dtype)
 
+    def known_so_far(carry, count, c):
+        rays, beyond, beyond2 = carry
+        scaled = c / jnp.maximum(count, 1.0)[:, None]
+        return rays + jnp.sum(count), beyond + jnp.sum(c, axis=0), beyond2 + _product(c.T, scaled)
+
     factor = None
     if slopes and known:
 
         def of_columns(f, i, carry):
-            rays, beyond, beyond2 = carry
             _, _, count, c = look(i)
-            scaled = c / jnp.maximum(count, 1.0)[:, None]
-            return (
-                rays + jnp.sum(count),
-                beyond + jnp.sum(c, axis=0),
-                beyond2 + _product(c.T, scaled),
-            )
+            return known_so_far(carry, count, c)
 
         found = over(of_columns, (zeros(), zeros(known), zeros(known, known)))
         factor = _factors(*found)
@@ -294,13 +293,14 @@ def _sums(weigher: _Weigher, paths: Paths, sent: Array, slopes: bool = False) ->
                 level, tilt = factor
                 counts = weight * jnp.repeat(level[f] - _product(scaled, tilt[f]), group)[:, None]
             by_sum = by_sum + _product(chunk.sums.T, counts)
+        rays, beyond, beyond2 = known_so_far((carry.rays, carry.beyond, carry.beyond2), count, c)
         return _Sums(
-            carry.rays + jnp.sum(count),
+            rays,
             carry.weight + jnp.sum(w, axis=0),
             carry.weight2 + jnp.sum(weight**2, axis=0),
             carry.squares + jnp.sum(w**2 * inverse, axis=0),
-            carry.beyond + jnp.sum(c, axis=0),
-            carry.beyond2 + _product(c.T, scaled),
+            beyond,
+            beyond2,
             carry.cross + _product(scaled.T, w),
             by_sum,
         )
@@ -318,15 +318,17 @@ def _others(x: Array) -> Array:
     return jnp.sum(x, axis=0, keepdims=True) - x
 
 
+def _solve(moments: Array, right: Array) -> Array:
+    """Solutions (k, n) of a regression from its second moments (k, k), with `RIDGE`."""
+    ridged = moments + jnp.diag(RIDGE * jnp.diag(moments) + TINY)
+    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(ridged), right)
+
+
 def _inverses(rays: Array, beyond2: Array) -> Array:
     """(f, k, k) of the moments that the other folds have; nothing where they have few rays."""
     moments = _others(beyond2)
-    own = jnp.diagonal(moments, axis1=1, axis2=2)
-    ridge = RIDGE * own + TINY * jnp.max(own, axis=1, keepdims=True) + TINY
-    moments = moments + jax.vmap(jnp.diag)(ridge)
-    inverse = jax.vmap(lambda a: jax.scipy.linalg.cho_solve(
-        jax.scipy.linalg.cho_factor(a), jnp.eye(len(a), dtype=a.dtype)
-    ))(moments)  # fmt: skip
+    one = jnp.eye(moments.shape[1], dtype=moments.dtype)
+    inverse = jax.vmap(_solve, (0, None))(moments, one)
     return jnp.where((_others(rays) >= ENOUGH)[:, None, None], inverse, 0.0)
 
 
@@ -411,8 +413,8 @@ def improve(paths: Paths, plan: Plan, asked: Layers, rays: int = PILOT) -> Plan:
         if name not in ("thickness", "bottom", "roughness")
     }
     pilot = Paths(*(part[:rays] for part in paths))
-    asked = asked._replace(**every)
-    return plan._replace(shares=_improve(pilot, plan.layers, asked, plan.shares))
+    shares = _improve(pilot, plan.layers, asked._replace(**every), plan.shares)
+    return plan._replace(shares=shares)
 
 
 @jax.jit
@@ -433,9 +435,7 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> Arra
         ray, mixed = _product(mean_of, now), _product(density, now)[:, None]
         known, weight = about_mean(density / mixed), about_mean(wanted / mixed)
         moments = _product(known.T, ray[:, None] * known)
-        moments = moments + jnp.diag(RIDGE * jnp.diag(moments) + TINY)
-        factor = jax.scipy.linalg.cho_factor(moments)
-        told = jax.scipy.linalg.cho_solve(factor, _product(known.T, ray[:, None] * weight))
+        told = _solve(moments, _product(known.T, ray[:, None] * weight))
         return ray, weight - _product(known, told)
 
     def better(_, state):

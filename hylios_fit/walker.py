@@ -48,7 +48,7 @@ ABSORBED, BY_HIT, AT_BOTTOM, ENDS = 1, 7, 10, 11
 NODES = scattering.LATIMER_ANGLE * np.sqrt(
     [0.0, 0.008, 0.03, 0.075, 0.14, 0.235, 0.36, 0.53, 0.74, 1.0]
 )
-FAR = 0.006  # and nodes that would weigh no more than this, 2.3 gaps away, count nothing
+FAR = 0.006  # nodes that would weigh no more, from 2.3 gaps away, count nothing
 EASE = 0.002  # added to squares of angles, over the largest, in whose logarithm reflectance is even
 DRAWS = 11  # random numbers that a step may take
 ROUND = 16  # steps between two exchanges of rays that ended

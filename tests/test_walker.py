@@ -14,6 +14,7 @@ from hylios_fit.skin import Specimen
 
 NM = np.array([300.0, 420.0, 550.0, 1450.0])
 FALLING = np.array([550.0, 900.0, 1100.0, 1450.0])  # theta_0 falls in the middle
+SPECTRUM = np.arange(250.0, 2501.0, 50.0)
 RAYS = 8192  # one shape for all walks, so that they share one compiled program
 S3 = Specimen.preset("S3")
 
@@ -442,7 +443,7 @@ def test_weights_in_single_precision_are_those_in_double(paths, layers, found):
 
 @pytest.fixture(scope="module")
 def spectrum():
-    return S3.layers(np.arange(250.0, 2501.0, 50.0))
+    return S3.layers(SPECTRUM)
 
 
 def test_a_plan_is_a_mixture_that_reaches_every_wavelength(spectrum):
@@ -490,8 +491,8 @@ def several(plan, key, form="complex", lots=4):
 
 @pytest.mark.parametrize(("name", "form"), [("S3", "complex"), ("S4", "dispersed")])
 def test_the_densities_of_all_paths_under_any_column_add_up_to_one(name, form):
-    nm = np.arange(250.0, 2501.0, 50.0)
-    plan = walker.plan(Specimen.preset(name).replace(bottom_reflectance=0.7).layers(nm))
+    specimen = Specimen.preset(name).replace(bottom_reflectance=0.7)
+    plan = walker.plan(specimen.layers(SPECTRUM))
     paths = several(plan, jax.random.key(24), form)
     weigher = tally._weigher(plan.layers, plan.layers, 1.0, plan.shares, ended=True)
     shares = np.asarray(plan.shares, float)
@@ -522,9 +523,8 @@ def test_what_the_columns_tell_makes_errors_smaller_and_changes_no_mean(spectrum
     z = off.mean(axis=0) / (off.std(axis=0, ddof=1) / math.sqrt(len(off)))
     assert np.abs(z).max() < 6  # of Student's t with 11 degrees of freedom
     variance = np.mean(error**2, axis=0) / np.mean(raw_error**2, axis=0)
-    nm = np.arange(250.0, 2501.0, 50.0)
     assert variance.max() < 1.1
-    assert np.mean(variance[(nm > 750) & (nm < 1200)]) < 0.7
+    assert np.mean(variance[(SPECTRUM > 750) & (SPECTRUM < 1200)]) < 0.7
     # the errors are those that repeated walks show
     scatter = np.var(steady, axis=0, ddof=1) / np.mean(error**2, axis=0)
     assert 0.7 < scatter.mean() < 1.4
