@@ -90,6 +90,7 @@ def _scene(scene: Scene, seed: int) -> dict[str, Any]:
                 "kept": {n: _shared.significant(e, 2) for n, e in made.kept.items()},
                 "told": {n: _shared.significant(e, 2) for n, e in made.told.items()},
                 "method": made.method,
+                "size": made.size,
                 "order": made.order,
                 "wavelengths": len(made.wavelength_nm),
                 "of_wavelengths": len(scene.wavelength_nm),
@@ -140,7 +141,7 @@ def draw(result: dict[str, Any], path: Any) -> None:
         gain = [scene["seconds"] / s["seconds"] for s in steps]
         times.plot(tolerances, gain, "o-", color=colour, label=name)
         for tolerance, s, at in zip(tolerances, steps, gain, strict=True):
-            text = "surrogate" if s["method"] == "surrogate" else f"{s['wavelengths']}"
+            text = s["size"] if s["method"] == "surrogate" else f"{s['wavelengths']}"
             times.annotate(
                 text, (tolerance, at), (0, 6), textcoords="offset points", fontsize=8,
                 color=colour, ha="center",

@@ -23,7 +23,7 @@ from experiments import _fresh, _shared
 from hylios_fit import adding, fresnel, skin, streams, table
 from hylios_fit.simulation import simulate
 from hylios_fit.skin import SPECS, Layers, Specimen
-from hylios_fit.surrogate import FLOOR, features, load_surrogate
+from hylios_fit.surrogate import FLOOR, Surrogate, features, load_surrogate
 from hylios_fit.threads import one_blas_thread
 
 NUMBER = 16
@@ -506,12 +506,13 @@ def _from_table(base: Any, seed: int, path: str | None, truth: Any, methods: lis
 
 
 def _embedded(base: Any, seed: int, truth: Any, methods: list) -> dict:
-    surrogate = load_surrogate()
+    surrogate, small = load_surrogate(), load_surrogate(size="small")
     record = _shared.surrogate_record(surrogate)
-    parts = _parts((*TRANSPORT, "surrogate"), **base, surrogate=record["sha256"])
+    hashes = {"sha256": record["sha256"], "small": small.about["sha256"]}
+    parts = _parts((*TRANSPORT, "surrogate"), **base, surrogate=hashes)
     whole = int(surrogate.at(surrogate.forms[0]).components.shape[0])
 
-    def measured(count: int) -> dict:
+    def measured(surrogate: Surrogate, count: int) -> dict:
         short = truncated(surrogate, count) if count < whole else surrogate
         on = {name: short.on(REGIMES[name][2]) for name in REGIMES}
         return _measured_rows(
@@ -521,9 +522,11 @@ def _embedded(base: Any, seed: int, truth: Any, methods: list) -> dict:
 
     counts = sorted({*(k for k in COMPONENTS if k < whole), whole})
     for count in counts:
-        found = parts(f"surrogate {count}", lambda count=count: measured(count))
+        found = parts(f"surrogate {count}", lambda count=count: measured(surrogate, count))
         methods.append({"family": "embedded surrogate", "label": str(count), **found})
-    return {"surrogate": {"sha256": record["sha256"], "components": whole}}
+    found = parts("small surrogate", lambda: measured(small, whole))
+    methods.append({"family": "small embedded surrogate", "label": str(whole), **found})
+    return {"surrogate": {**hashes, "components": whole}}
 
 
 # --- the figure --------------------------------------------------------------------------------
@@ -534,6 +537,7 @@ FAMILIES = {  # colour, marker, label of the legend
     "adding": ("#c8553d", "o"),
     "adding, float32": ("#e39b86", "o"),
     "embedded surrogate": ("#3a7d44", "s"),
+    "small embedded surrogate": ("#8cc084", "s"),
     "polynomial ridge, degree 2": ("#b58900", "D"),
     "polynomial ridge, degree 3": ("#b58900", "P"),
     "kernel ridge, 1536 rows": ("#7a4fa3", "D"),

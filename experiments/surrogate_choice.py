@@ -20,6 +20,7 @@ from hylios_fit.surrogate import features
 from hylios_fit.threads import one_blas_thread
 
 FORM = "complex"
+CHOSEN = training.SIZES["small"][0]
 LOCAL_STEPS = 10_000
 STEPS = 10_000
 BATCH = 1024
@@ -95,13 +96,13 @@ def run(
         }
 
     sizes = [Perceptron(hidden, steps, batch, seed=seed) for hidden in perceptrons]
-    networks = [Adam(training.HIDDEN, ADAM * steps, batch, seed), *sizes[::-1]]  # longest first
+    networks = [Adam(CHOSEN, ADAM * steps, batch, seed), *sizes[::-1]]  # longest first
     with one_blas_thread(), ThreadPoolExecutor(training.THREADS) as pool:
         made = pool.map(learned, networks)
         adam, *made = tqdm(made, total=len(networks), unit="perceptron", disable=not progress)
     return {
         "form": FORM, **settings, "steps": steps, "batch": batch, "fresh": fresh, "bands": BANDS,
-        "chosen": list(training.HIDDEN), "components": training.COMPONENTS,
+        "chosen": list(CHOSEN), "components": training.COMPONENTS,
         "local": rms(log),
         "perceptrons": made[::-1],
         "adam": {**adam, "steps": ADAM * steps},

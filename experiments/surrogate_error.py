@@ -1,4 +1,4 @@
-"""How far the embedded surrogate is from the solver: reflectance, colour and slopes."""
+"""How far the embedded surrogates are from the solver: reflectance, colour and slopes."""
 
 from __future__ import annotations
 
@@ -27,21 +27,29 @@ def run(
     seed: int = 0,
     each: int = EACH,
     slopes: int = SLOPES,
-    surrogate: Surrogate | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
     """Fresh specimens from the prior, with the pigments, blood, water and lipids free and the rest
     at the model's values, as in a usual fit; with every parameter free; and as the first, without
     melanosomes in the upper strata, as light skin has them and the prior of the fits never."""
-    surrogate = surrogate or load_surrogate()
-    nm = surrogate.wavelength_nm
-    found: dict[str, Any] = {
+    surrogate, small = load_surrogate(), load_surrogate(size="small")
+    return {
         "surrogate": _shared.surrogate_record(surrogate),
         "order": training.CHECK_ORDER,
         "goals": GOALS,
-        "wavelength_nm": nm.tolist(),
-        "kinds": {},
-    }
+        "wavelength_nm": surrogate.wavelength_nm.tolist(),
+        **_held(surrogate, seed, each, slopes, progress),
+        "small": {
+            "sha256": small.about["sha256"], **_held(small, seed, each, slopes, progress)
+        },
+    }  # fmt: skip
+
+
+def _held(
+    surrogate: Surrogate, seed: int, each: int, slopes: int, progress: bool
+) -> dict[str, Any]:
+    found: dict[str, Any] = {"kinds": {}}
+    nm = surrogate.wavelength_nm
     names = surrogate.at(surrogate.forms[0]).names
     folder = _shared.checkpoint("surrogate_error", MODULES, seed=seed, names=names)
     for number, (kind, fewer) in enumerate(KINDS.items()):
@@ -119,6 +127,11 @@ def draw(result: dict[str, Any], path: Any) -> None:
         label = f"{labels[kind]}: RMS {both['rms']:.1e}"
         left.plot(nm, both["rms_by_wavelength"], color=colour, label=label)
         left.plot(nm, both["q99_by_wavelength"], color=colour, ls=":", lw=1)
+    every = result["small"]["kinds"]["every"]["both"]
+    left.plot(
+        nm, every["rms_by_wavelength"], color=_shared.COLOURS[1], ls="--", lw=1,
+        label=f"the small surrogate, every parameter free: RMS {every['rms']:.1e}",
+    )  # fmt: skip
     left.axhline(result["goals"]["rms"], color="black", ls="--", lw=0.8)
     left.set_yscale("log")
     left.legend(fontsize=8)

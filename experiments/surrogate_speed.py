@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -11,13 +14,15 @@ import jax
 import numpy as np
 
 from experiments import _shared
-from hylios_fit.surrogate import Surrogate, load_surrogate
+from hylios_fit.surrogate import EMBEDDED, Surrogate, load_surrogate
 
 BATCHES = (1, 16, 256, 4096, 16_384, 65_536)
 REPEATS = 15  # of each batch, in turns, so that what else the machine does meets all alike
 ALONE = 1000  # calls of one spectrum
 GOALS = {"451 wavelengths": 300_000, "3 narrow bands": 2_000_000, "3 camera bands": 2_000_000}
 GOAL_ALONE_US = 100.0
+DISPATCH = {"another thread": True, "the calling thread": False}
+"""Where JAX starts what is asked of a CPU: the first is its default."""
 
 
 def scenes(surrogate: Surrogate) -> dict[str, Surrogate]:
@@ -37,7 +42,6 @@ def run(
     batches: Any = BATCHES,
     repeats: int = REPEATS,
     alone: int = ALONE,
-    surrogate: Surrogate | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
     """Times of the public call, parameters checked, in NumPy arrays; compiling apart.
@@ -47,9 +51,13 @@ def run(
     """
     from tqdm import tqdm
 
-    found = scenes(surrogate or load_surrogate())
-    rows = _rows(next(iter(found.values())), max(batches), seed)
-    calls = {name: _waited(call) for name, call in found.items()}
+    surrogates = {size: load_surrogate(size=size) for size in EMBEDDED}
+    rows = _rows(surrogates["large"], max(batches), seed)
+    calls = {
+        f"{scene}, {size}": _waited(call)
+        for size, surrogate in surrogates.items()
+        for scene, call in scenes(surrogate).items()
+    }
     compiling = {}
     for name, call in calls.items():
         start = time.perf_counter()
@@ -63,25 +71,37 @@ def run(
             rates[name].append(
                 {"batch": size, **_summary(size / clock), "per_core_second": per_core}
             )
-
-    jitted = jax.jit(next(iter(found.values())))
-    single = {
-        "surrogate(x)": calls["451 wavelengths"],
-        "jax.jit(surrogate)(x)": _waited(jitted),
-        "surrogate.on(3 bands)(x)": calls["3 narrow bands"],
-    }
-    microseconds = {
-        name: _summary(1e6 * clock) for name, (clock, _) in _times(single, rows[0], alone).items()
-    }
     return {
-        "surrogate": _shared.surrogate_record(next(iter(found.values()))),
+        "surrogate": _shared.surrogate_record(surrogates["large"]),
+        "small": surrogates["small"].about["sha256"],
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
         "load_average": _shared.significant(os.getloadavg()[0], 2),
         "goals_per_second": GOALS,
         "goal_alone_us": GOAL_ALONE_US,
         "compile_s": compiling,
         "per_second": rates,
-        "alone_us": microseconds,
+        "alone_us": {f"in {name}": _in_a_process(way, alone) for name, way in DISPATCH.items()},
+    }
+
+
+def _in_a_process(another_thread: bool, repeats: int) -> dict[str, Any]:
+    """`alone` in a process of its own: JAX asks where to start things when it begins, and once."""
+    call = [sys.executable, "-m", "experiments.surrogate_speed", str(int(another_thread))]
+    said = subprocess.run([*call, str(repeats)], check=True, capture_output=True, text=True).stdout
+    return json.loads(said)
+
+
+def alone(repeats: int) -> dict[str, Any]:
+    """Microseconds of one spectrum by the large surrogate."""
+    found = scenes(load_surrogate())
+    single = {
+        "surrogate(x)": _waited(found["451 wavelengths"]),
+        "jax.jit(surrogate)(x)": _waited(jax.jit(found["451 wavelengths"])),
+        "surrogate.on(3 bands)(x)": _waited(found["3 narrow bands"]),
+    }
+    row = _rows(found["451 wavelengths"], 1, 0)[0]
+    return {
+        name: _summary(1e6 * clock) for name, (clock, _) in _times(single, row, repeats).items()
     }
 
 
@@ -121,32 +141,39 @@ def _summary(values: np.ndarray) -> dict[str, Any]:
 
 def draw(result: dict[str, Any], path: Any) -> None:
     """Spectra a second against the batch, and the time of one call."""
-    figure = _shared.figure(9.0, 4.2)
-    batches, alone = figure.subplots(1, 2, width_ratios=(3, 2))
-    for colour, (name, points) in zip(_shared.COLOURS, result["per_second"].items(), strict=False):
+    figure = _shared.figure(11.0, 4.6)
+    batches, alone = figure.subplots(1, 2, width_ratios=(5, 4))
+    names = list(result["goals_per_second"])
+    for name, points in result["per_second"].items():
+        scene, kind = name.rsplit(", ", 1)
+        if scene not in names:
+            continue
+        colour, large = _shared.COLOURS[names.index(scene)], kind == "large"
         size = [point["batch"] for point in points]
         low, median, high = ([p[k] for p in points] for k in ("low", "median", "high"))
         batches.fill_between(size, low, high, color=colour, alpha=0.15, lw=0)
-        batches.plot(size, median, "o-", ms=4, lw=1.4, color=colour, label=name)
         batches.plot(
-            size, [point["per_core_second"] for point in points], ":", lw=1.2, color=colour
-        )
-        if name in ("451 wavelengths", "3 camera bands"):
-            goal = result["goals_per_second"][name]
-            batches.axhline(goal, color=colour, ls="--", lw=0.9)
-            label = "goal, whole spectra" if name == "451 wavelengths" else "goal, three bands"
+            size, median, "o-" if large else "s--", ms=4, lw=1.4, color=colour,
+            mfc=colour if large else "white", label=name,
+        )  # fmt: skip
+        if large and scene != "3 narrow bands":  # the goal of both
+            goal = result["goals_per_second"][scene]
+            batches.axhline(goal, color=colour, ls=":", lw=1.1)
+            label = "goal, whole spectra" if scene == "451 wavelengths" else "goal, three bands"
             batches.annotate(label, (size[0], goal * 1.1), fontsize=7.5, color=colour)
     batches.set_xscale("log")
     batches.set_yscale("log")
     batches.legend(fontsize=8, loc="lower right")
     _shared.tidy(
         batches, "spectra in a batch", "spectra a second",
-        f"{result['cores']} cores, load {result['load_average']:g}; "
-        "dotted: a second of one core's time",
+        f"{result['cores']} cores, load {result['load_average']:g}",
     )  # fmt: skip
-    names = list(result["alone_us"])
-    for row, name in enumerate(names):
-        one = result["alone_us"][name]
+    rows = [
+        (f"{call}\nstarted {where}", one)
+        for where, calls in result["alone_us"].items()
+        for call, one in calls.items()
+    ]
+    for row, (_, one) in enumerate(rows):
         alone.plot([one["low"], one["high"]], [row, row], color=_shared.COLOURS[0], lw=5, alpha=0.3)
         alone.plot(one["median"], row, "o", color=_shared.COLOURS[0])
         alone.annotate(
@@ -155,8 +182,15 @@ def draw(result: dict[str, Any], path: Any) -> None:
         )  # fmt: skip
     goal = result["goal_alone_us"]
     alone.axvline(goal, color="black", ls="--", lw=0.9)
-    alone.set_yticks(range(len(names)), names, fontsize=8)
-    alone.set_ylim(len(names) - 0.5, -0.6)
-    alone.set_xlim(0, 1.15 * max(goal, *(one["high"] for one in result["alone_us"].values())))
-    _shared.tidy(alone, "one spectrum (µs)", "", "median and 10 to 90 % of the calls")
+    alone.set_yticks(range(len(rows)), [name for name, _ in rows], fontsize=7.5)
+    alone.set_ylim(len(rows) - 0.5, -0.6)
+    alone.set_xlim(0, 1.15 * max(goal, *(one["high"] for _, one in rows)))
+    _shared.tidy(
+        alone, "one spectrum by the large surrogate (µs)", "", "median and 10 to 90 % of the calls"
+    )
     _shared.save_figure(figure, path)
+
+
+if __name__ == "__main__":  # the child of `_in_a_process`
+    jax.config.update("jax_cpu_enable_async_dispatch", bool(int(sys.argv[1])))
+    print(json.dumps(alone(int(sys.argv[2]))))

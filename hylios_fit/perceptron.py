@@ -65,15 +65,19 @@ class Perceptron(RegressorMixin, BaseEstimator):
     ) -> Perceptron:
         """Inputs (n, f), standardised, and targets (n, k) of about unit size; weights (n,).
 
-        `along` are how both change, (n, f) and (n, k), along one direction at each example: then
-        the slope there is learned too (Czarnecki et al. 2017, arXiv:1706.04859).
+        `along` are how both change, (m, f) and (m, k), along one direction at each of the last m
+        examples: then the slope there is learned too (Czarnecki et al. 2017, arXiv:1706.04859).
         """
         x, y = jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32)
         weight = jnp.asarray(np.ones(len(x)) if sample_weight is None else sample_weight)
-        data = _Data(x, y, weight.astype(jnp.float32))
+        columns = x, y, weight.astype(jnp.float32)
+        plain = len(x) if along is None else len(x) - len(along[0])
+        data = []  # what has no slopes takes half the time
+        if plain:
+            data.append(_Data(*(column[:plain] for column in columns)))
         if along is not None:
-            dx, dy = along
-            data = data._replace(dx=jnp.asarray(dx, jnp.float32), dy=jnp.asarray(dy, jnp.float32))
+            changes = (jnp.asarray(part, jnp.float32) for part in along)
+            data.append(_Data(*(column[plain:] for column in columns), *changes))
         first, batches = jax.random.split(jax.random.key(self.seed))
         widths = (x.shape[1], *self.hidden, y.shape[1])
         layers = _start(first, widths)
@@ -84,8 +88,9 @@ class Perceptron(RegressorMixin, BaseEstimator):
         for stage, (low, high) in enumerate(itertools.pairwise(marks)):
             if stage >= done:
                 layers = _descend(
-                    layers, data, batches, (low, high, turns), self.rate, penalty, batch=self.batch
-                )
+                    layers, tuple(data), batches, (low, high, turns), self.rate, penalty,
+                    batch=self.batch,
+                )  # fmt: skip
                 jax.block_until_ready(layers)
                 self._save(layers, stage + 1)
             if self.bar is not None:
@@ -167,28 +172,48 @@ _answer = jax.jit(_forward)
 _times = partial(jnp.matmul, precision="highest")
 
 
-def _loss(matrices: list[Array], data: _Data, penalty: Array) -> Array:
-    if data.dx is None:
-        error = jnp.sum((_forward(matrices, data.x) - data.y) ** 2, axis=1)
-    else:
-        y, dy = jax.jvp(partial(_forward, matrices), (data.x,), (data.dx,))
-        error = jnp.sum((y - data.y) ** 2 + (dy - data.dy) ** 2, axis=1)
+def _loss(
+    matrices: list[Array], data: tuple[_Data, ...], shares: tuple[float, ...], penalty: Array
+) -> Array:
+    """Half of the squared error, a mean over parts of the examples with these shares, and of the
+    penalty."""
+
+    def error(part: _Data) -> Array:
+        if part.dx is None:
+            squares = (_forward(matrices, part.x) - part.y) ** 2
+        else:
+            y, dy = jax.jvp(partial(_forward, matrices), (part.x,), (part.dx,))
+            squares = (y - part.y) ** 2 + (dy - part.dy) ** 2
+        return jnp.mean(part.weight * jnp.sum(squares, axis=1))
+
+    errors = sum(share * error(part) for share, part in zip(shares, data, strict=True))
     weights = sum(jnp.sum(matrix[:-1] ** 2) for matrix in matrices)
-    return 0.5 * (jnp.mean(data.weight * error) + penalty * weights)
+    return 0.5 * (errors + penalty * weights)
+
+
+def _drawn(key: Any, data: tuple[_Data, ...], counts: list[int]) -> tuple[_Data, ...]:
+    """So many examples of each part, with replacement."""
+    found = []
+    for number, (part, count) in enumerate(zip(data, counts, strict=True)):
+        own = jax.random.fold_in(key, number) if number else key
+        chosen = jax.random.randint(own, (count,), 0, len(part.x))
+        found.append(jax.tree.map(lambda column, chosen=chosen: column[chosen], part))
+    return tuple(found)
 
 
 @partial(jax.jit, static_argnames="batch")
 def _descend(
-    layers: tuple[_Layer, ...], data: _Data, key: Any, turns: Any, rate: Any, penalty: Any,
-    batch: int,
+    layers: tuple[_Layer, ...], data: tuple[_Data, ...], key: Any, turns: Any, rate: Any,
+    penalty: Any, batch: int,
 ) -> tuple[_Layer, ...]:  # fmt: skip
     """From one turn of the eigenvectors to another; the third of `turns` is how many in all."""
     low, high, whole = turns
+    shares = tuple(len(part.x) / sum(len(other.x) for other in data) for part in data)
+    counts = [max(round(batch * share), 1) for share in shares]
 
     def step(number: Array, layers: tuple[_Layer, ...]) -> tuple[_Layer, ...]:
-        chosen = jax.random.randint(jax.random.fold_in(key, number), (batch,), 0, len(data.x))
-        drawn = jax.tree.map(lambda part: part[chosen], data)
-        gradients = jax.grad(_loss)([layer.matrix for layer in layers], drawn, penalty)
+        drawn = _drawn(jax.random.fold_in(key, number), data, counts)
+        gradients = jax.grad(_loss)([layer.matrix for layer in layers], drawn, shares, penalty)
         count = number.astype(jnp.float32) + 1.0
         done = count / (whole.astype(jnp.float32) * TURN)
         size = rate * jnp.minimum(done / WARM, 0.5 + 0.5 * jnp.cos(math.pi * done))

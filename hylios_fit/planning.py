@@ -27,6 +27,7 @@ from hylios_fit.errors import HyliosError
 from hylios_fit.simulation import Curve, check_request
 from hylios_fit.skin import LAYERS, SPECS, Layers, Specimen
 from hylios_fit.statevector import PRIORS
+from hylios_fit.surrogate import EMBEDDED, load_surrogate
 
 SPECIMENS = 128  # that are solved at every wavelength
 PROBES = 8  # of them, on which each parameter is tried
@@ -151,6 +152,8 @@ class Plan:
         layers that were dropped: they neither absorb nor scatter, and still refract.
     method, order
         the cheapest that meets the tolerance: `surrogate`, or `adding` at that order.
+    size
+        of the embedded surrogate that does, or would come closest: `small` or `large`.
     rays
         at most that many a band would bring a walk's standard error to the tolerance.
     wavelength_nm, offset, matrix
@@ -169,6 +172,7 @@ class Plan:
     held: Mapping[str, float]
     clear: tuple[str, ...]
     method: str
+    size: str
     order: int
     rays: int
     wavelength_nm: np.ndarray
@@ -183,7 +187,7 @@ class Plan:
 
     @cached_property
     def _member(self) -> Any:
-        return _member(self.scene)
+        return _member(self.scene, self.size)
 
     def reflectance(self, specimens: Sequence[Specimen]) -> Float[np.ndarray, "n b"]:
         """The bands of many specimens, specular included, by the method of the plan.
@@ -214,7 +218,7 @@ class Plan:
 
     def __str__(self) -> str:
         nm, bands = self.scene.wavelength_nm, len(self.offset)
-        how = "the embedded surrogate"
+        how = f"the {self.size} embedded surrogate"
         if self.method == "adding":
             how = f"adding of order {self.order} at {len(self.wavelength_nm)} of {nm.size} "
             how += "wavelengths"
@@ -278,17 +282,20 @@ def plan(scene: Scene, tolerance: float) -> Plan:
             break
         out.pop()
     method = "adding"
-    member = _member(scene)
-    if member is not None:
+    for size in EMBEDDED:
+        member = _member(scene, size)
+        if member is None:
+            continue
         missed = float(np.max(np.abs(_asked(member, rows) - truth)))
         if missed <= 0.75 * tolerance:
             method, error = "surrogate", missed
+            break
     told = _told(fisher / tolerance**2, ranged, out)
     return Plan(
         scene, tolerance,
         kept=MappingProxyType({n: effects[n] for n in reversed(effects) if n not in out}),
         dropped=MappingProxyType({n: effects[n] for n in reversed(effects) if n in out}),
-        held=MappingProxyType(values), clear=clear, method=method, order=order,
+        held=MappingProxyType(values), clear=clear, method=method, size=size, order=order,
         rays=math.ceil(np.max(truth * (1.0 - truth)) / tolerance**2),
         wavelength_nm=nm, offset=offset, matrix=matrix, error=error,
         told=MappingProxyType(told),
@@ -483,12 +490,10 @@ def _told(fisher: np.ndarray, names: tuple[str, ...], out: Sequence[str]) -> dic
 # --- the surrogate ------------------------------------------------------------------------------
 
 
-def _member(scene: Scene) -> Any:
-    """The embedded surrogate on the scene's bands; None where it knows no such scene."""
-    from hylios_fit.surrogate import load_surrogate
-
+def _member(scene: Scene, size: str) -> Any:
+    """An embedded surrogate on the scene's bands; None where it knows no such scene."""
     try:
-        surrogate = load_surrogate()
+        surrogate = load_surrogate(size=size)
         usual = Specimen().values
         strange = [
             name for name, value in scene.specimen.values.items()

@@ -31,6 +31,7 @@ from hylios_fit.skin import LAYERS, SPECS, STRATA, Specimen
 
 FORMAT = "hylios_fit surrogate"
 FORMAT_VERSION = 5
+EMBEDDED = {"small": "surrogate_small.npz", "large": "surrogate.npz"}  # the cheapest first
 FLOOR = 0.3
 """Added to the subsurface reflectance before the logarithm: errors are less than relative."""
 
@@ -475,11 +476,17 @@ def digest(arrays: dict[str, np.ndarray]) -> str:
     return found.hexdigest()
 
 
-def load_surrogate(path: str | Path | None = None) -> Surrogate:
-    """The embedded surrogate, or the one in a file that `hylios-fit train` wrote."""
-    if path is None:
-        return _load(datasets.data_path("surrogate.npz"))
-    return _load(Path(path))
+def load_surrogate(path: str | Path | None = None, size: str = "large") -> Surrogate:
+    """An embedded surrogate, or the one in a file that `hylios-fit train` wrote.
+
+    `size` chooses among the embedded: the large one, or the small one, which errs more and is
+    twice as fast on few bands (`Surrogate.on`).
+    """
+    if path is not None:
+        return _load(Path(path))
+    if size not in EMBEDDED:
+        raise HyliosError(f"size: expected one of {', '.join(EMBEDDED)}, got {size!r}")
+    return _load(datasets.data_path(EMBEDDED[size]))
 
 
 @lru_cache(maxsize=4)

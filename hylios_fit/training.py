@@ -64,7 +64,7 @@ FURTHER = {"index_dispersion": (-0.005, 0.035)}
 """Ranges of parameters that the table has no axis for and its indices cover."""
 FIRST = 3e-3
 """Hits in a straight pass that free the light which total reflection keeps in a clear epidermis."""
-LOCAL_HIDDEN = (192, 192, 192)
+LOCAL_HIDDEN = (256, 256, 256)
 LOCAL_STEPS = 40_000
 LOCAL_BATCH = 2048
 ALIKE = 100.0  # entries of a walked table whose noise is as good as one: they share paths
@@ -79,8 +79,8 @@ LEAST = {True: 0.025, False: 0.003}
 LOOKED_AT = 384  # specimens that say how much it does
 SPECIMENS = 131_072  # of each form, that the local regression answers for
 COMPONENTS = 80
-HIDDEN = (192, 128, 128)
-STEPS = 120_000
+SIZES = {"large": ((256, 256, 192), 80_000), "small": ((192, 128, 128), 120_000)}
+"""Hidden units and steps: whole spectra leave time for the first, few bands need the second."""
 BATCH = 1024
 SEEN, EMPHASIS = (380.0, 720.0), 2.0  # nm; errors count so much more where the eye sees them
 CORNERS = 0.25  # what a specimen from all over the box weighs: the hardest, and few fits are there
@@ -99,8 +99,11 @@ def train(
     seed: int = 0,
     checks: int = CHECKS,
     progress: bool = True,
+    size: str = "large",
 ) -> str:
     """Train on the table and write the surrogate; returns the report that `check` prints.
+
+    `size` is one of `SIZES`: the small one errs more and is twice as fast on few bands.
 
     What is done stays in a folder beside the output, `OUT.training`, until all is: interrupted, the
     same call goes on there.
@@ -113,20 +116,22 @@ def train(
         HyliosError: a table that cannot be learned from (`read_table`), a folder of another
             training, or one that cannot be written.
     """
+    if size not in SIZES:
+        raise HyliosError(f"size: expected one of {', '.join(SIZES)}, got {size!r}")
     table = read_table(table_path, LEAST_ROWS)
-    steps = Checkpoints(f"{out_path}.training", _follows_from(table, seed))
+    steps = Checkpoints(f"{out_path}.training", _follows_from(table, seed, size))
     with claimed(steps.folder) as mine:
         if not mine:
             raise HyliosError(f"another process is training {out_path}: {steps.folder} is its")
         if progress and steps.begun():
             print(f"going on with {steps.folder}", file=sys.stderr)
-        path = save(out_path, *_trained(table, seed, checks, progress, steps))
+        path = save(out_path, *_trained(table, seed, checks, progress, steps, size))
         steps.remove()
     return check_report(load_surrogate(path))
 
 
 def _trained(
-    table: Any, seed: int, checks: int, progress: bool, steps: Checkpoints
+    table: Any, seed: int, checks: int, progress: bool, steps: Checkpoints, size: str
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """What the file holds: its numbers, and what is said about them."""
     from hylios_fit import __version__
@@ -143,7 +148,7 @@ def _trained(
         "upper": upper,
         "fresnel": curve.convert(domain=(0.5, 2.5)).coef,
     }
-    for form, fitted in _fits(table, forms, seed, progress, steps).items():
+    for form, fitted in _fits(table, forms, seed, progress, steps, size).items():
         parts = {**fitted, "modes": np.zeros((1, nm.size)), "rest": np.zeros(nm.size)}
         arrays.update({f"{form}/{name}": a.astype(np.float32) for name, a in parts.items()})
 
@@ -158,7 +163,8 @@ def _trained(
         "rows_of_a_group": int(table.attrs["rows_of_a_group"]),
         "table_seed": int(table.attrs["seed"]),
         "seed": seed,
-        "depth": len(HIDDEN) + 1,
+        "size": size,
+        "depth": len(SIZES[size][0]) + 1,
         "held_out": f"{checks} fresh specimens of each form, by adding-doubling",
         "held_out_rms": {},
         "held_out_most": {},
@@ -175,8 +181,8 @@ def _trained(
     return arrays, about
 
 
-def _follows_from(table: Any, seed: int) -> dict[str, Any]:
-    """All that a training depends on: the table, the seed, the version and its constants."""
+def _follows_from(table: Any, seed: int, size: str) -> dict[str, Any]:
+    """All that a training depends on: the table, seed and size, the version and its constants."""
     from hylios_fit import __version__
 
     columns = "design", "form", "reflectance", "standard_error", "lower", "upper"
@@ -185,6 +191,7 @@ def _follows_from(table: Any, seed: int) -> dict[str, Any]:
         "table": digest({name: table[name].values for name in columns}),
         "generator": table.attrs["generator"],
         "seed": seed,
+        "size": size,
         "hylios_fit": __version__,
         "constants": {
             f"{module}.{name}": repr(value)
@@ -530,9 +537,7 @@ def learn_locally(
             for _ in range(ways)
         ]
         inputs, logs, *changes = (np.concatenate(part) for part in zip(*lots, strict=True))
-        # what has no slopes is looked at along no way, where nothing changes
-        dx, dy = (np.pad(change, ((len(x), 0), (0, 0))) for change in changes)
-        along = dx / scale, dy / unit
+        along = changes[0] / scale, changes[1] / unit
         x, y = np.concatenate([x, (inputs - centre) / scale]), np.concatenate([y, logs])
         weight = np.concatenate([weight, np.resize(seen, len(logs))])  # wavelength by wavelength
     y = (y - middle) / unit
@@ -623,7 +628,7 @@ def _lots(rows: np.ndarray, size: int = 8) -> list[Array]:
 
 
 def _fits(
-    table: Any, forms: tuple[str, ...], seed: int, progress: bool, steps: Checkpoints
+    table: Any, forms: tuple[str, ...], seed: int, progress: bool, steps: Checkpoints, size: str
 ) -> dict[str, dict[str, np.ndarray]]:
     """By form: every number of the fitted pipeline by name."""
     from tqdm import tqdm
@@ -646,7 +651,7 @@ def _fits(
             local = learn_locally(table, form, seed, bar, finer=finer, step=kept)
             x, log, along = answers(local, names, asked, seed)
             kept = steps.step(f"{form}-network")
-            network = Perceptron(HIDDEN, STEPS, BATCH, seed=seed, bar=bar, step=kept)
+            network = Perceptron(*SIZES[size], BATCH, seed=seed, bar=bar, step=kept)
             seen = emphasis(table["wavelength_nm"].values)
             return fit(x, log, network, along, importance(len(asked)), seen)
 

@@ -289,7 +289,8 @@ def test_a_table_is_made_trained_from_and_checked(folder, monkeypatch, capsys):
     monkeypatch.setattr(table, "FORMS", ("complex",))
     monkeypatch.setattr(training, "solve", solve)
     for name, value in (
-        ("HIDDEN", (8, 8)), ("LOCAL_HIDDEN", (8, 8)), ("STEPS", 90), ("LOCAL_STEPS", 90),
+        ("SIZES", {"large": ((8, 8), 90), "small": ((6, 6), 60)}),
+        ("LOCAL_HIDDEN", (8, 8)), ("LOCAL_STEPS", 90),
         ("SPECIMENS", 512), ("COMPONENTS", 8), ("LOOKED_AT", 16),
     ):  # fmt: skip
         monkeypatch.setattr(training, name, value)

@@ -69,6 +69,31 @@ def test_slopes_are_learned_too_and_tell_more_than_values():
     assert rms(np.asarray(jax.jvp(network.answer, (at,), (way,))[1]), dy) < 0.05 * rms(0.0, dy)
 
 
+def test_slopes_are_those_of_the_last_examples():
+    """Values at some places and slopes at others, both learned, each with its share."""
+    x, y = smooth(400)
+    y = y[:, :1]
+    dx = np.zeros((100, 3))
+    dx[:, 0] = 1.0
+    dy = np.cos(x[300:, 0] + x[300:, 1])[:, None]
+    weight = np.r_[np.ones(300), np.full(100, 2.0)]
+    network = Perceptron((32, 32), steps=2000, batch=100, rate=0.01)
+    network.fit(x, y, weight, along=(dx, dy))
+    at, way = jnp.asarray(x[300:], jnp.float32), jnp.asarray(dx, jnp.float32)
+    assert rms(np.asarray(jax.jvp(network.answer, (at,), (way,))[1]), dy) < 0.05
+    assert rms(network.predict(x), y) < 0.05
+    # as if the others were looked at along no way, where nothing changes
+    columns = [jnp.asarray(column, jnp.float32) for column in (x, y, weight)]
+    changes = [jnp.asarray(column, jnp.float32) for column in (dx, dy)]
+    padded = [jnp.pad(column, ((300, 0), (0, 0))) for column in changes]
+    matrices, none = network._matrices(), jnp.float32(0.0)
+    whole = perceptron._loss(matrices, (perceptron._Data(*columns, *padded),), (1.0,), none)
+    plain = perceptron._Data(*(column[:300] for column in columns))
+    sloped = perceptron._Data(*(column[300:] for column in columns), *changes)
+    parts = perceptron._loss(matrices, (plain, sloped), (0.75, 0.25), none)
+    np.testing.assert_allclose(parts, whole, rtol=1e-5)
+
+
 def test_along_no_way_nothing_is_learned():
     x, y = smooth(300)
     network = Perceptron((8,), steps=100, batch=64)

@@ -250,7 +250,11 @@ def test_the_experiment_on_speed_measures_what_it_draws(surrogate, tmp_path):
     from experiments import surrogate_speed
 
     found = surrogate_speed.run(batches=(1, 8), repeats=3, alone=4, progress=False)
-    assert set(found["goals_per_second"]) < set(found["per_second"]) == set(found["compile_s"])
+    assert set(found["per_second"]) == set(found["compile_s"])
+    assert {name.rsplit(", ")[0] for name in found["per_second"]} > set(found["goals_per_second"])
+    assert {name.rsplit(", ")[1] for name in found["per_second"]} == {"large", "small"}
+    for calls in found["alone_us"].values():
+        assert all(0 < one["low"] <= one["median"] <= one["high"] for one in calls.values())
     for points in found["per_second"].values():
         assert [point["batch"] for point in points] == [1, 8]
         assert all(0 < point["low"] <= point["median"] <= point["high"] for point in points)
@@ -358,7 +362,8 @@ def quick(monkeypatch):
     """Small networks, few specimens, and the stand-in also where training checks itself."""
     monkeypatch.setattr(training, "solve", stand_in)
     for name, value in (
-        ("HIDDEN", (32, 32)), ("STEPS", 1000), ("LOCAL_HIDDEN", (24, 24)), ("LOCAL_STEPS", 2000),
+        ("SIZES", {"large": ((32, 32), 1000), "small": ((24, 24), 500)}),
+        ("LOCAL_HIDDEN", (24, 24)), ("LOCAL_STEPS", 2000),
         ("SPECIMENS", 2048), ("COMPONENTS", 16), ("ORDER_STEPS", 300), ("WAYS", (1, 1)),
         ("LOOKED_AT", 16),
     ):  # fmt: skip
