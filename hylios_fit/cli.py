@@ -160,7 +160,7 @@ def _parser() -> argparse.ArgumentParser:
         "surrogate",
         metavar="SURROGATE",
         nargs="?",
-        help="a file, or small for the smaller of the embedded; default: the large one",
+        help="a file, or an embedded one, large (default) or small",
     )
 
     fit = command("fit", _fit, "melanin, blood and water from measured spectra")
@@ -190,7 +190,7 @@ def _parser() -> argparse.ArgumentParser:
     fit.add_argument(
         "--surrogate",
         metavar="FILE",
-        help="or small, for the smaller of the embedded (default: the large one)",
+        help="or an embedded one, large (default) or small",
     )
     fit.add_argument("--posterior", action="store_true", help="sample each posterior with emcee")
     _seed(fit)

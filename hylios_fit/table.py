@@ -506,7 +506,7 @@ def generate(
                 for future in as_completed(futures):
                     if future.result():
                         starts.remove(futures[future])
-                        bar.update(step)
+                        bar.update(int(_done(path).sum()) - bar.n)  # those of others too
             except BaseException:
                 for future in futures:
                     future.cancel()

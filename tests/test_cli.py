@@ -304,5 +304,7 @@ def test_a_table_is_made_trained_from_and_checked(folder, monkeypatch, capsys):
     said = capsys.readouterr().out
     assert "256 rows" in said
     assert "worst band" in said
+    assert run("check", "small") == 0
+    assert "16384 rows" in capsys.readouterr().out
     assert {path.name for path in folder.iterdir()} >= {"t.zarr", "s.npz"}
     assert not list(folder.glob(".*"))

@@ -112,8 +112,27 @@ def test_a_curve_with_its_error(camera):
     np.testing.assert_allclose(curve.wavelength_nm, (600, 540, 450), atol=8.0)
 
 
+def test_the_smaller_surrogate_that_will_do_is_taken(camera, monkeypatch):
+    assert (camera.method, camera.size) == ("surrogate", "small")
+    # where that is off by a hundredth it will not, and the other is asked
+    member = planning._member
+    small = member(camera.scene, "small")
+    monkeypatch.setattr(
+        planning, "_member", lambda scene, size: small if size == "small" else member(scene, size)
+    )
+    asked = planning._asked
+    monkeypatch.setattr(
+        planning, "_asked", lambda one, rows: asked(one, rows) + (0.01 if one is small else 0.0)
+    )
+    made = hf.plan(camera.scene, TOLERANCE)
+    assert (made.method, made.size) == ("surrogate", "large")
+    assert made.error <= 0.75 * TOLERANCE
+    assert made._member is not small
+
+
 def test_it_can_be_read(camera):
     text = str(camera)
+    assert "the small embedded surrogate" in text
     for part in ("3 bands, 400 to 700 nm", "0.005", "lipids", "held at 1", "left out", "can tell"):
         assert part in text
 

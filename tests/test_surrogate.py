@@ -50,6 +50,23 @@ def test_embedded_agrees_with_the_walker(surrogate, name):
     assert np.sqrt(np.mean(z**2)) < 3
 
 
+def test_the_small_one_knows_the_same_with_less(surrogate):
+    small = load_surrogate(size="small")
+    assert small.names == surrogate.names
+    np.testing.assert_array_equal(small.wavelength_nm, surrogate.wavelength_nm)
+    for form in surrogate.forms:
+        one, other = small.at(form), surrogate.at(form)
+        np.testing.assert_array_equal(one.lower, other.lower)
+        np.testing.assert_array_equal(one.upper, other.upper)
+        assert sum(w.size for w in one.weights) < 0.6 * sum(w.size for w in other.weights)
+        missed = [np.mean(np.square(s.about["held_out_rms"][form])) for s in (small, surrogate)]
+        assert missed[0] > missed[1]
+        both = np.asarray([m(Specimen.preset("S3").parameters(m.names)) for m in (one, other)])
+        assert 0 < np.abs(both[0] - both[1]).max() < 0.003
+    with pytest.raises(HyliosError, match="size: expected one of small, large, got 'medium'"):
+        load_surrogate(size="medium")
+
+
 def test_outside_the_range_is_an_error_with_names_and_ranges(surrogate):
     with pytest.raises(HyliosError, match=r"water = 0.2 \(trained on 0.4 to 1.3\)"):
         surrogate(vector(surrogate, water=0.2))

@@ -287,6 +287,39 @@ def test_a_failed_beginning_leaves_nothing(small, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_bar_counts_rows_that_another_process_made(quick, tmp_path, monkeypatch):
+    class Bar(list):
+        def __init__(self, total, initial, **_):
+            self.n, self.total = initial, total
+            super().__init__([initial])
+
+        def update(self, count):
+            self.n += count
+            self.append(self.n)
+
+        def __enter__(self):
+            bars.append(self)
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+    bars = []
+    monkeypatch.setattr("tqdm.tqdm", Bar)
+    path = empty(tmp_path / "t.zarr")
+    make_chunk = table.make_chunk
+
+    def beside(path, start):  # another process makes the chunk that follows, first
+        make_chunk(path, (start + STEP) % ROWS)
+        return make_chunk(path, start)
+
+    monkeypatch.setattr(table, "make_chunk", beside)
+    make(path, resume=True, threads=1)
+    assert bars[0][0] == 0
+    assert bars[0][1] >= 2 * STEP
+    assert bars[0][-1] == bars[0].total == ROWS
+
+
 # --- growing -------------------------------------------------------------------------------------
 
 
