@@ -134,6 +134,7 @@ def draw(result: dict[str, Any], path: Any) -> None:
     )  # fmt: skip
     left.axhline(result["goals"]["rms"], color="black", ls="--", lw=0.8)
     left.set_yscale("log")
+    left.set_ylim(bottom=1e-6)  # room for the legend
     left.legend(fontsize=8)
     numbers = ", ".join(str(told["both"]["specimens"]) for told in result["kinds"].values())
     title = f"{numbers} fresh specimens; dotted: 99 % lie below"
