@@ -12,7 +12,7 @@ from hylios_fit.skin import Specimen
 from hylios_fit.surrogate import FLOOR
 
 SEED = 0
-"""Of the tables, as of the one that the embedded surrogate was trained on."""
+"""Of the tables, as of the one that the embedded surrogates were trained on."""
 
 
 class Fresh(NamedTuple):

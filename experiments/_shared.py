@@ -76,12 +76,13 @@ def save_json(path: Path, content: Any) -> None:
         json.dump(content, file)
 
 
-def surrogate_record(surrogate: Any) -> dict[str, Any]:
-    """Which surrogate was used: the hash of the embedded file, and its box."""
+def surrogate_record(surrogate: Any, size: str = "large") -> dict[str, Any]:
+    """Which surrogate was used: the hash of the embedded file of this size, and its box."""
     from hylios_fit.datasets import data_folder
+    from hylios_fit.surrogate import EMBEDDED
 
     member = surrogate.at(surrogate.forms[0])
-    path = data_folder() / "surrogate.npz"
+    path = data_folder() / EMBEDDED[size]
     return {
         "class": type(surrogate).__name__,
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None,

@@ -508,12 +508,14 @@ def _from_table(base: Any, seed: int, path: str | None, truth: Any, methods: lis
 def _embedded(base: Any, seed: int, truth: Any, methods: list) -> dict:
     surrogate, small = load_surrogate(), load_surrogate(size="small")
     record = _shared.surrogate_record(surrogate)
-    hashes = {"sha256": record["sha256"], "small": small.about["sha256"]}
+    hashes = {
+        "sha256": record["sha256"], "small": _shared.surrogate_record(small, "small")["sha256"]
+    }  # fmt: skip
     parts = _parts((*TRANSPORT, "surrogate"), **base, surrogate=hashes)
     whole = int(surrogate.at(surrogate.forms[0]).components.shape[0])
 
-    def measured(surrogate: Surrogate, count: int) -> dict:
-        short = truncated(surrogate, count) if count < whole else surrogate
+    def measured(asked: Surrogate, count: int) -> dict:
+        short = truncated(asked, count) if count < whole else asked
         on = {name: short.on(REGIMES[name][2]) for name in REGIMES}
         return _measured_rows(
             lambda rows, name: np.asarray(on[name](rows), float),

@@ -20,6 +20,7 @@ from hylios_fit.surrogate import features
 from hylios_fit.threads import one_blas_thread
 
 FORM = "complex"
+# the embedded one that these compare: the other has a larger local regression as well
 CHOSEN = training.SIZES["small"][0]
 LOCAL_STEPS = 10_000
 STEPS = 10_000
@@ -48,8 +49,8 @@ def run(
     perceptrons: tuple[tuple[int, ...], ...] = PERCEPTRONS,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """The training of the embedded surrogate with fewer steps and specimens, of one form, and with
-    other regressions; held against the solver on specimens that none has seen."""
+    """The training of the small embedded surrogate, of one form, with fewer steps and specimens and
+    with other regressions; held against the solver on specimens that none has seen."""
     from tqdm import tqdm
 
     if data is None:

@@ -40,7 +40,8 @@ def run(
         "wavelength_nm": surrogate.wavelength_nm.tolist(),
         **_held(surrogate, seed, each, slopes, progress),
         "small": {
-            "sha256": small.about["sha256"], **_held(small, seed, each, slopes, progress)
+            "sha256": _shared.surrogate_record(small, "small")["sha256"],
+            **_held(small, seed, each, slopes, progress),
         },
     }  # fmt: skip
 
@@ -66,7 +67,10 @@ def _held(
             kept = folder / f"{kind}_{form}_{count}.npz"
             truth = _shared.kept_arrays(kept, lambda f=solve: {"truth": f()})["truth"]
             parts[form] = np.asarray(member(rows.astype(np.float32)), float), truth
-        told = {form: _errors(nm, *pair) for form, pair in parts.items()}
+        told = {
+            form: {k: v for k, v in _errors(nm, *pair).items() if not k.endswith("by_wavelength")}
+            for form, pair in parts.items()
+        }
         every = [np.concatenate(part) for part in zip(*parts.values(), strict=True)]
         found["kinds"][kind] = {"both": _errors(nm, *every), **told}
     found["slopes"] = {

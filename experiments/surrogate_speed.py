@@ -73,25 +73,30 @@ def run(
             )
     return {
         "surrogate": _shared.surrogate_record(surrogates["large"]),
-        "small": surrogates["small"].about["sha256"],
+        "small": _shared.surrogate_record(surrogates["small"], "small")["sha256"],
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
         "load_average": _shared.significant(os.getloadavg()[0], 2),
         "goals_per_second": GOALS,
         "goal_alone_us": GOAL_ALONE_US,
         "compile_s": compiling,
         "per_second": rates,
-        "alone_us": {f"in {name}": _in_a_process(way, alone) for name, way in DISPATCH.items()},
+        "alone_us": {
+            f"in {name}": _in_a_process(way, alone, seed) for name, way in DISPATCH.items()
+        },
     }
 
 
-def _in_a_process(another_thread: bool, repeats: int) -> dict[str, Any]:
-    """`alone` in a process of its own: JAX asks where to start things when it begins, and once."""
-    call = [sys.executable, "-m", "experiments.surrogate_speed", str(int(another_thread))]
-    said = subprocess.run([*call, str(repeats)], check=True, capture_output=True, text=True).stdout
-    return json.loads(said)
+def _in_a_process(another_thread: bool, repeats: int, seed: int) -> dict[str, Any]:
+    """`_single` in a process of its own: JAX asks where to start things once, as it begins."""
+    asked = [str(int(value)) for value in (another_thread, repeats, seed)]
+    call = [sys.executable, "-m", "experiments.surrogate_speed", *asked]
+    said = subprocess.run(
+        call, check=True, stdout=subprocess.PIPE, text=True, cwd=_shared.REPOSITORY
+    )
+    return json.loads(said.stdout)
 
 
-def alone(repeats: int) -> dict[str, Any]:
+def _single(repeats: int, seed: int) -> dict[str, Any]:
     """Microseconds of one spectrum by the large surrogate."""
     found = scenes(load_surrogate())
     single = {
@@ -99,7 +104,7 @@ def alone(repeats: int) -> dict[str, Any]:
         "jax.jit(surrogate)(x)": _waited(jax.jit(found["451 wavelengths"])),
         "surrogate.on(3 bands)(x)": _waited(found["3 narrow bands"]),
     }
-    row = _rows(found["451 wavelengths"], 1, 0)[0]
+    row = _rows(found["451 wavelengths"], 1, seed)[0]
     return {
         name: _summary(1e6 * clock) for name, (clock, _) in _times(single, row, repeats).items()
     }
@@ -193,4 +198,4 @@ def draw(result: dict[str, Any], path: Any) -> None:
 
 if __name__ == "__main__":  # the child of `_in_a_process`
     jax.config.update("jax_cpu_enable_async_dispatch", bool(int(sys.argv[1])))
-    print(json.dumps(alone(int(sys.argv[2]))))
+    print(json.dumps(_single(int(sys.argv[2]), int(sys.argv[3]))))

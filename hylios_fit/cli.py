@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from hylios_fit.spectra import Spectra
     from hylios_fit.surrogate import Surrogate
 
+SIZES = ("small", "large")
 METHODS = ("walker", "analog", "adding", "surrogate")
 SIMULATION_HEADER = ("wavelength_nm", "reflectance", "standard_error", "surface", "subsurface")
 SENSITIVITY_HEADER = ("material", "domain", "msi", "msi_counted")
@@ -151,8 +152,8 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("table", metavar="TABLE")
     train.add_argument("-o", dest="output", metavar="SURROGATE", required=True)
     train.add_argument(
-        "--size", choices=("large", "small"), default="large",
-        help="small: larger errors, twice as fast on few bands",
+        "--size", choices=SIZES, default="large",
+        help="small: larger errors, twice as fast in batches of few bands",
     )  # fmt: skip
 
     check = command("check", _check, "held-out errors of a surrogate and the range it knows")
@@ -190,7 +191,7 @@ def _parser() -> argparse.ArgumentParser:
     fit.add_argument(
         "--surrogate",
         metavar="FILE",
-        help="or an embedded one, large (default) or small",
+        help="a file, or an embedded one, large (default) or small",
     )
     fit.add_argument("--posterior", action="store_true", help="sample each posterior with emcee")
     _seed(fit)
@@ -427,7 +428,7 @@ def _check(args: argparse.Namespace) -> int:
 def _load_surrogate(path: str | None) -> Surrogate:
     from hylios_fit.surrogate import EMBEDDED, load_surrogate
 
-    if path in EMBEDDED and not Path(path).exists():
+    if path in EMBEDDED and not Path(path).is_file():
         return load_surrogate(size=path)
     return load_surrogate(None if path is None else _existing(path))
 

@@ -95,7 +95,7 @@ def fit(
 
     Args:
         spectrum: what `as_spectra` takes, such as `(wavelength_nm, reflectance)`, holding one.
-        surrogate: the embedded one, if None.
+        surrogate: the large embedded one, if None.
         noise: standard deviation of the reflectance: a number, one for each band (B,), or its
             covariance (B, B). None: what came with the spectra, else the instrument's model.
         free: names of the parameters that vary, and `usual` for pigments, blood, water and lipids

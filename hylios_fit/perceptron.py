@@ -71,6 +71,8 @@ class Perceptron(RegressorMixin, BaseEstimator):
         x, y = jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32)
         weight = jnp.asarray(np.ones(len(x)) if sample_weight is None else sample_weight)
         columns = x, y, weight.astype(jnp.float32)
+        if along is not None and not len(along[0]):
+            along = None
         plain = len(x) if along is None else len(x) - len(along[0])
         data = []  # what has no slopes takes half the time
         if plain:
@@ -175,7 +177,7 @@ _times = partial(jnp.matmul, precision="highest")
 def _loss(
     matrices: list[Array], data: tuple[_Data, ...], shares: tuple[float, ...], penalty: Array
 ) -> Array:
-    """Half of the squared error, a mean over parts of the examples with these shares, and of the
+    """Half of: the mean squared error over parts that are such shares of the examples, and the
     penalty."""
 
     def error(part: _Data) -> Array:
@@ -191,14 +193,10 @@ def _loss(
     return 0.5 * (errors + penalty * weights)
 
 
-def _drawn(key: Any, data: tuple[_Data, ...], counts: list[int]) -> tuple[_Data, ...]:
-    """So many examples of each part, with replacement."""
-    found = []
-    for number, (part, count) in enumerate(zip(data, counts, strict=True)):
-        own = jax.random.fold_in(key, number) if number else key
-        chosen = jax.random.randint(own, (count,), 0, len(part.x))
-        found.append(jax.tree.map(lambda column, chosen=chosen: column[chosen], part))
-    return tuple(found)
+def _drawn(key: Any, part: _Data, count: int) -> _Data:
+    """So many examples, with replacement."""
+    chosen = jax.random.randint(key, (count,), 0, len(part.x))
+    return jax.tree.map(lambda column: column[chosen], part)
 
 
 @partial(jax.jit, static_argnames="batch")
@@ -212,7 +210,9 @@ def _descend(
     counts = [max(round(batch * share), 1) for share in shares]
 
     def step(number: Array, layers: tuple[_Layer, ...]) -> tuple[_Layer, ...]:
-        drawn = _drawn(jax.random.fold_in(key, number), data, counts)
+        own = jax.random.fold_in(key, number)
+        keys = (jax.random.fold_in(own, i) if i else own for i in range(len(data)))
+        drawn = tuple(map(_drawn, keys, data, counts))
         gradients = jax.grad(_loss)([layer.matrix for layer in layers], drawn, shares, penalty)
         count = number.astype(jnp.float32) + 1.0
         done = count / (whole.astype(jnp.float32) * TURN)

@@ -153,7 +153,7 @@ class Plan:
     method, order
         the cheapest that meets the tolerance: `surrogate`, or `adding` at that order.
     size
-        of the embedded surrogate that does, or would come closest: `small` or `large`.
+        of the embedded surrogate that does, `small` or `large`; None for the solver.
     rays
         at most that many a band would bring a walk's standard error to the tolerance.
     wavelength_nm, offset, matrix
@@ -172,7 +172,7 @@ class Plan:
     held: Mapping[str, float]
     clear: tuple[str, ...]
     method: str
-    size: str
+    size: str | None
     order: int
     rays: int
     wavelength_nm: np.ndarray
@@ -187,6 +187,7 @@ class Plan:
 
     @cached_property
     def _member(self) -> Any:
+        assert self.size is not None
         return _member(self.scene, self.size)
 
     def reflectance(self, specimens: Sequence[Specimen]) -> Float[np.ndarray, "n b"]:
@@ -281,21 +282,21 @@ def plan(scene: Scene, tolerance: float) -> Plan:
         if error <= 0.75 * tolerance or not out:
             break
         out.pop()
-    method = "adding"
+    method, taken = "adding", None
     for size in EMBEDDED:
         member = _member(scene, size)
         if member is None:
             continue
         missed = float(np.max(np.abs(_asked(member, rows) - truth)))
         if missed <= 0.75 * tolerance:
-            method, error = "surrogate", missed
+            method, taken, error = "surrogate", size, missed
             break
     told = _told(fisher / tolerance**2, ranged, out)
     return Plan(
         scene, tolerance,
         kept=MappingProxyType({n: effects[n] for n in reversed(effects) if n not in out}),
         dropped=MappingProxyType({n: effects[n] for n in reversed(effects) if n in out}),
-        held=MappingProxyType(values), clear=clear, method=method, size=size, order=order,
+        held=MappingProxyType(values), clear=clear, method=method, size=taken, order=order,
         rays=math.ceil(np.max(truth * (1.0 - truth)) / tolerance**2),
         wavelength_nm=nm, offset=offset, matrix=matrix, error=error,
         told=MappingProxyType(told),

@@ -55,7 +55,7 @@ def sample(
     Args:
         fit: what `fit` or `fit_many` gave, with estimates.
         key: a JAX key; the same key gives the same draws.
-        surrogate: the one that was fitted with; the embedded one, if None.
+        surrogate: the one that was fitted with, which need not be said of an embedded one.
         walkers: of each of the 2 ensembles, an even number, at least twice the free parameters;
             None: four times.
         steps: at most, of each ensemble; sampling ends early once the chains are 50
@@ -81,13 +81,20 @@ def sample(
     if not isinstance(steps, int) or steps < 10:
         raise HyliosError(f"steps: expected a whole number from 10, got {steps!r}")
     if surrogate is None:
-        from hylios_fit.surrogate import load_surrogate
-
-        surrogate = load_surrogate()
+        surrogate = _embedded(fit)
     with jax.enable_x64(True), one_blas_thread():
         vector, density = log_posterior(fit, surrogate)
         chains, acceptance = _run(fit, density, key, walkers, steps, progress)
         return _posterior(fit, vector, chains, acceptance, key)
+
+
+def _embedded(fit: Fit) -> Any:
+    """The embedded surrogate that was fitted with; the large one, if none of them was."""
+    from hylios_fit.surrogate import EMBEDDED, load_surrogate
+
+    every = {size: load_surrogate(size=size) for size in EMBEDDED}
+    mine = [one for one in every.values() if one.about["sha256"] == fit.settings.get("surrogate")]
+    return mine[0] if mine else every["large"]
 
 
 def log_posterior(
@@ -97,6 +104,12 @@ def log_posterior(
 
     To be called where JAX's x64 is enabled. Raises `HyliosError` for another surrogate.
     """
+    hashes = fit.settings.get("surrogate"), getattr(surrogate, "about", {}).get("sha256")
+    if all(hashes) and hashes[0] != hashes[1]:
+        raise HyliosError(
+            f"{fit.spectrum!r} was fitted with the surrogate {hashes[0][:8]}, got {hashes[1][:8]}: "
+            "give the one that it was fitted with"
+        )
     if fit.form not in surrogate.forms:
         raise HyliosError(f"the surrogate has no form {fit.form!r}: expected that of the fit")
     whole = surrogate.at(fit.form)

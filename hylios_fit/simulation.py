@@ -62,7 +62,7 @@ def simulate(
     `walker` spreads `rays` over all wavelengths and shares their paths; `analog` sends `rays` rays
     at each wavelength; `adding` solves without noise (its `standard_error` is what the next lower
     order differs by, and the rejection of particles is a mean over rays, `skin.let_stand`);
-    `surrogate` asks the embedded one (8 degrees, its own training range).
+    `surrogate` asks the large embedded one (8 degrees, its own training range).
     With `tolerance`, rays are added until every standard error is below it, up to `MOST_RAYS`;
     `note` says so if that was not enough. Both walks need a `key` (`jax.random.key(seed)`).
     """

@@ -479,8 +479,8 @@ def digest(arrays: dict[str, np.ndarray]) -> str:
 def load_surrogate(path: str | Path | None = None, size: str = "large") -> Surrogate:
     """An embedded surrogate, or the one in a file that `hylios-fit train` wrote.
 
-    `size` chooses among the embedded: the large one, or the small one, which errs more and is
-    twice as fast on few bands (`Surrogate.on`).
+    `size` chooses among the embedded, without a path: the large one, or the small one, which errs
+    more and in batches of few bands (`Surrogate.on`) is twice as fast.
     """
     if path is not None:
         return _load(Path(path))
@@ -564,6 +564,7 @@ def check_report(surrogate: Surrogate) -> str:
     lines = [
         f"surrogate of {about['rows']} rows ({about['generator']}), "
         f"hylios_fit {about['hylios_fit']}, seed {about['seed']}",
+        f"hidden units: {', '.join(str(w.shape[1]) for w in member.weights[:-1])}",
         f"held out: {about['held_out']}",
         "",
         "trained on:",

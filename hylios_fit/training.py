@@ -103,7 +103,7 @@ def train(
 ) -> str:
     """Train on the table and write the surrogate; returns the report that `check` prints.
 
-    `size` is one of `SIZES`: the small one errs more and is twice as fast on few bands.
+    `size` is one of `SIZES`: the small one errs more, and in batches of few bands is twice as fast.
 
     What is done stays in a folder beside the output, `OUT.training`, until all is: interrupted, the
     same call goes on there.
@@ -191,13 +191,13 @@ def _follows_from(table: Any, seed: int, size: str) -> dict[str, Any]:
         "table": digest({name: table[name].values for name in columns}),
         "generator": table.attrs["generator"],
         "seed": seed,
-        "size": size,
+        "size": SIZES[size],
         "hylios_fit": __version__,
         "constants": {
             f"{module}.{name}": repr(value)
             for module, names in modules.items()
             for name, value in names.items()
-            if name.isupper()
+            if name.isupper() and name != "SIZES"
         },
     }
 

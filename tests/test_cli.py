@@ -289,7 +289,7 @@ def test_a_table_is_made_trained_from_and_checked(folder, monkeypatch, capsys):
     monkeypatch.setattr(table, "FORMS", ("complex",))
     monkeypatch.setattr(training, "solve", solve)
     for name, value in (
-        ("SIZES", {"large": ((8, 8), 90), "small": ((6, 6), 60)}),
+        ("SIZES", {"large": ((8, 8), 90), "small": ((7, 6), 60)}),
         ("LOCAL_HIDDEN", (8, 8)), ("LOCAL_STEPS", 90),
         ("SPECIMENS", 512), ("COMPONENTS", 8), ("LOOKED_AT", 16),
     ):  # fmt: skip
@@ -298,13 +298,15 @@ def test_a_table_is_made_trained_from_and_checked(folder, monkeypatch, capsys):
     assert run("table", "-o", "t.zarr", "--rows", 256) == 2
     assert "--resume" in capsys.readouterr().err
     assert run("table", "-o", "t.zarr", "--rows", 256, "--seed", 5, "--resume") == 0
-    assert run("train", "t.zarr", "-o", "s.npz") == 0
+    assert run("train", "t.zarr", "-o", "s.npz", "--size", "small") == 0
     capsys.readouterr()
     assert run("check", "s.npz") == 0
     said = capsys.readouterr().out
     assert "256 rows" in said
+    assert "hidden units: 7, 6\n" in said
     assert "worst band" in said
-    assert run("check", "small") == 0
-    assert "16384 rows" in capsys.readouterr().out
+    for size, units in (("small", "192, 128, 128"), ("large", "256, 256, 192")):
+        assert run("check", size) == 0
+        assert f"hidden units: {units}\n" in capsys.readouterr().out
     assert {path.name for path in folder.iterdir()} >= {"t.zarr", "s.npz"}
     assert not list(folder.glob(".*"))

@@ -94,6 +94,18 @@ def test_slopes_are_those_of_the_last_examples():
     np.testing.assert_allclose(parts, whole, rtol=1e-5)
 
 
+def test_examples_with_slopes_count_by_their_share():
+    """Where they say 1 and three times as many others 0, of half the weight: 0.4 is between."""
+    x, y = np.zeros((400, 3)), np.repeat([0.0, 1.0], [300, 100])[:, None]
+    weight = np.repeat([1.0, 2.0], [300, 100])
+    still = np.zeros((100, 3)), np.zeros((100, 1))
+    network = Perceptron((4,), steps=2000, batch=64).fit(x, y, weight, along=still)
+    np.testing.assert_allclose(network.predict(x[:1]), 0.4, atol=0.02)
+    # and of no slopes at all
+    found = clone(network).fit(x, y, weight, along=(still[0][:0], still[1][:0])).predict(x[:1])
+    np.testing.assert_array_equal(found, clone(network).fit(x, y, weight).predict(x[:1]))
+
+
 def test_along_no_way_nothing_is_learned():
     x, y = smooth(300)
     network = Perceptron((8,), steps=100, batch=64)

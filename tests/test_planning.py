@@ -128,6 +128,10 @@ def test_the_smaller_surrogate_that_will_do_is_taken(camera, monkeypatch):
     assert (made.method, made.size) == ("surrogate", "large")
     assert made.error <= 0.75 * TOLERANCE
     assert made._member is not small
+    # and where both are, the solver
+    monkeypatch.setattr(planning, "_asked", lambda one, rows: asked(one, rows) + 0.01)
+    made = hf.plan(camera.scene, TOLERANCE)
+    assert (made.method, made.size) == ("adding", None)
 
 
 def test_it_can_be_read(camera):

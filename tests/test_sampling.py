@@ -16,6 +16,8 @@ from hylios_fit.results import (
     read_posteriors,
     write_posteriors,
 )
+from hylios_fit.skin import Specimen
+from hylios_fit.surrogate import load_surrogate
 
 TOY = ToySurrogate()
 BANDS = np.linspace(400.0, 1000.0, 13)
@@ -89,6 +91,20 @@ def test_the_density_is_that_of_the_fit(fit):
         at = density(np.concatenate([fit.z[None], near]))
         assert np.all(at[0] > at[1:])
         assert density(np.full((1, 3), np.nan))[0] == -np.inf
+
+
+def test_it_is_sampled_with_the_surrogate_that_it_was_fitted_with():
+    """Also where nobody says which of the embedded that was, and no other is taken."""
+    large, small = load_surrogate(), load_surrogate(size="small")
+    values = np.asarray(small.at("complex")(Specimen.preset("S3").parameters(small.names[:-1])))
+    use = np.arange(30, 91, 10)
+    measured = small.wavelength_nm[use], values[use]
+    fit = inversion.fit(measured, small, noise=0.002, free=FREE, fix={"melanosome_form": "complex"})
+    asked = {"key": jax.random.key(1), "steps": 10, "progress": False}
+    found, same = (sampling.sample(fit, surrogate=one, **asked) for one in (None, small))
+    np.testing.assert_array_equal(found.draws(FREE[0]), same.draws(FREE[0]))
+    with pytest.raises(HyliosError, match=r"was fitted with the surrogate .*, got"):
+        sampling.sample(fit, surrogate=large, **asked)
 
 
 def test_the_data_hold_every_quantity_and_every_free_parameter(posterior):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hylios_fit import fresnel, perceptron, table, training
+from hylios_fit import cli, fresnel, perceptron, table, training
 from hylios_fit import surrogate as module
 from hylios_fit.checkpoints import Checkpoints
 from hylios_fit.datasets import data_path
@@ -65,6 +65,7 @@ def test_the_small_one_knows_the_same_with_less(surrogate):
         assert 0 < np.abs(both[0] - both[1]).max() < 0.003
     with pytest.raises(HyliosError, match="size: expected one of small, large, got 'medium'"):
         load_surrogate(size="medium")
+    assert set(module.EMBEDDED) == set(training.SIZES) == set(cli.SIZES)
 
 
 def test_outside_the_range_is_an_error_with_names_and_ranges(surrogate):
@@ -270,7 +271,9 @@ def test_the_experiment_on_speed_measures_what_it_draws(surrogate, tmp_path):
     assert set(found["per_second"]) == set(found["compile_s"])
     assert {name.rsplit(", ")[0] for name in found["per_second"]} > set(found["goals_per_second"])
     assert {name.rsplit(", ")[1] for name in found["per_second"]} == {"large", "small"}
+    assert len(found["alone_us"]) == len(surrogate_speed.DISPATCH) == 2
     for calls in found["alone_us"].values():
+        assert len(calls) == 3
         assert all(0 < one["low"] <= one["median"] <= one["high"] for one in calls.values())
     for points in found["per_second"].values():
         assert [point["batch"] for point in points] == [1, 8]
@@ -413,6 +416,10 @@ def test_training_learns_a_smooth_table_and_states_its_error(tmp_path, quick, mo
     assert sorted(path.name for path in tmp_path.iterdir()) == ["s.npz.training", "table.zarr"]
     with pytest.raises(HyliosError, match=r"s\.npz\.training holds .* with other seed"):
         training.train(*paths, seed=1, progress=False)
+    with pytest.raises(HyliosError, match=r"s\.npz\.training holds .* with other size"):
+        training.train(*paths, size="small", progress=False)
+    with pytest.raises(HyliosError, match="size: expected one of large, small, got 'tiny'"):
+        training.train(*paths, size="tiny", progress=False)
     learned, descend = [], perceptron._descend
 
     def counted(*args, **more):
