@@ -525,7 +525,7 @@ def _embedded(base: Any, seed: int, truth: Any, methods: list) -> dict:
     counts = sorted({*(k for k in COMPONENTS if k < whole), whole})
     for count in counts:
         found = parts(f"surrogate {count}", lambda count=count: measured(surrogate, count))
-        methods.append({"family": "embedded surrogate", "label": str(count), **found})
+        methods.append({"family": "large embedded surrogate", "label": str(count), **found})
     found = parts("small surrogate", lambda: measured(small, whole))
     methods.append({"family": "small embedded surrogate", "label": str(whole), **found})
     return {"surrogate": {**hashes, "components": whole}}
@@ -538,7 +538,7 @@ FAMILIES = {  # colour, marker, label of the legend
     "walker": ("#1b6ca8", "^"),
     "adding": ("#c8553d", "o"),
     "adding, float32": ("#e39b86", "o"),
-    "embedded surrogate": ("#3a7d44", "s"),
+    "large embedded surrogate": ("#3a7d44", "s"),
     "small embedded surrogate": ("#8cc084", "s"),
     "polynomial ridge, degree 2": ("#b58900", "D"),
     "polynomial ridge, degree 3": ("#b58900", "P"),
