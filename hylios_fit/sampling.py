@@ -104,10 +104,11 @@ def log_posterior(
 
     To be called where JAX's x64 is enabled. Raises `HyliosError` for another surrogate.
     """
-    hashes = fit.settings.get("surrogate"), getattr(surrogate, "about", {}).get("sha256")
-    if all(hashes) and hashes[0] != hashes[1]:
+    mine = str(fit.settings.get("surrogate") or "")
+    given = str(getattr(surrogate, "about", {}).get("sha256") or "")
+    if mine and given and mine != given:
         raise HyliosError(
-            f"{fit.spectrum!r} was fitted with the surrogate {hashes[0][:8]}, got {hashes[1][:8]}: "
+            f"{fit.spectrum!r} was fitted with the surrogate {mine[:8]}, got {given[:8]}: "
             "give the one that it was fitted with"
         )
     if fit.form not in surrogate.forms:

@@ -314,7 +314,7 @@ def test_the_bar_counts_rows_that_another_process_made(quick, tmp_path, monkeypa
         return make_chunk(path, start)
 
     monkeypatch.setattr(table, "make_chunk", beside)
-    make(path, resume=True, threads=1)
+    table.generate(path, rows=ROWS, rays=RAYS, resume=True, threads=1)
     assert bars[0][0] == 0
     assert bars[0][1] >= 2 * STEP
     assert bars[0][-1] == bars[0].total == ROWS
