@@ -76,16 +76,21 @@ def save_json(path: Path, content: Any) -> None:
         json.dump(content, file)
 
 
-def surrogate_record(surrogate: Any, size: str = "large") -> dict[str, Any]:
-    """Which surrogate was used: the hash of the embedded file of this size, and its box."""
+def embedded_hash(size: str = "large") -> str | None:
+    """Of the file of an embedded surrogate."""
     from hylios_fit.datasets import data_folder
     from hylios_fit.surrogate import EMBEDDED
 
-    member = surrogate.at(surrogate.forms[0])
     path = data_folder() / EMBEDDED[size]
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+
+
+def surrogate_record(surrogate: Any) -> dict[str, Any]:
+    """Which surrogate was used: the hash of the large embedded file, and its box."""
+    member = surrogate.at(surrogate.forms[0])
     return {
         "class": type(surrogate).__name__,
-        "sha256": hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None,
+        "sha256": embedded_hash(),
         "lower": dict(zip(member.names, np.asarray(member.lower, float).tolist(), strict=True)),
         "upper": dict(zip(member.names, np.asarray(member.upper, float).tolist(), strict=True)),
     }

@@ -18,7 +18,7 @@ from experiments import _shared
 from hylios_fit import adding, planning
 from hylios_fit.planning import Plan, Scene, plan
 from hylios_fit.skin import SPECS, Specimen
-from hylios_fit.surrogate import EMBEDDED, load_surrogate
+from hylios_fit.surrogate import EMBEDDED
 
 RANGES = {
     "melanosome_basale": (0.5, 8.0),
@@ -51,10 +51,7 @@ def scenes() -> dict[str, Scene]:
 
 def run(seed: int = 0) -> dict[str, Any]:
     """What is dropped, the error and the time, for each scene and tolerance; resumable."""
-    surrogate = {
-        size: _shared.surrogate_record(load_surrogate(size=size), size)["sha256"]
-        for size in EMBEDDED
-    }
+    surrogate = {size: _shared.embedded_hash(size) for size in EMBEDDED}
     folder = _shared.checkpoint(
         "plan", MODULES, ranges=RANGES, seed=seed, fresh=FRESH, surrogate=surrogate
     )

@@ -507,10 +507,7 @@ def _from_table(base: Any, seed: int, path: str | None, truth: Any, methods: lis
 
 def _embedded(base: Any, seed: int, truth: Any, methods: list) -> dict:
     surrogate, small = load_surrogate(), load_surrogate(size="small")
-    record = _shared.surrogate_record(surrogate)
-    hashes = {
-        "sha256": record["sha256"], "small": _shared.surrogate_record(small, "small")["sha256"]
-    }  # fmt: skip
+    hashes = {"sha256": _shared.embedded_hash(), "small": _shared.embedded_hash("small")}
     parts = _parts((*TRANSPORT, "surrogate"), **base, surrogate=hashes)
     whole = int(surrogate.at(surrogate.forms[0]).components.shape[0])
 

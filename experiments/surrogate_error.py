@@ -40,7 +40,7 @@ def run(
         "wavelength_nm": surrogate.wavelength_nm.tolist(),
         **_held(surrogate, seed, each, slopes, progress),
         "small": {
-            "sha256": _shared.surrogate_record(small, "small")["sha256"],
+            "sha256": _shared.embedded_hash("small"),
             **_held(small, seed, each, slopes, progress),
         },
     }  # fmt: skip

@@ -92,9 +92,11 @@ def _embedded(fit: Fit) -> Any:
     """The embedded surrogate that was fitted with; the large one, if none of them was."""
     from hylios_fit.surrogate import EMBEDDED, load_surrogate
 
-    every = {size: load_surrogate(size=size) for size in EMBEDDED}
-    mine = [one for one in every.values() if one.about["sha256"] == fit.settings.get("surrogate")]
-    return mine[0] if mine else every["large"]
+    for size in EMBEDDED:
+        one = load_surrogate(size=size)
+        if one.about["sha256"] == fit.settings.get("surrogate"):
+            return one
+    return load_surrogate()
 
 
 def log_posterior(

@@ -507,7 +507,7 @@ def generate(
                     if future.result():
                         starts.remove(futures[future])
                         if progress:  # others may be at it, too
-                            bar.update(_written(path, total) - bar.n)
+                            bar.update(_written(path, total, step) - bar.n)
             except BaseException:
                 for future in futures:
                     future.cancel()
@@ -526,12 +526,14 @@ def _done(path: Path) -> np.ndarray:
         raise HyliosError(f"{path} is damaged: {error}; make the table again") from error
 
 
-def _written(path: Path, total: int) -> int:
+def _written(path: Path, total: int, step: int) -> int:
     """Rows of the first `total` that are finished, without a look into their files."""
-    store = _open(path)
-    step = store["standard_error"].chunks[0]
-    chunks = (path / "standard_error" / "c" / str(i) / "0" for i in range(total // step))
-    return step * sum(chunk.exists() for chunk in chunks)
+    return step * sum((_chunk(path, i) / "0").exists() for i in range(total // step))
+
+
+def _chunk(path: Path, number: int) -> Path:
+    """Where a chunk's standard errors go, which are written last."""
+    return path / "standard_error" / "c" / str(number)
 
 
 def make_chunk(path: str, start: int) -> bool:
@@ -545,7 +547,7 @@ def make_chunk(path: str, start: int) -> bool:
     _same(about, folder, "was begun", hylios_fit=_version())
     part = slice(start, start + store["standard_error"].chunks[0])
     number = start // store["standard_error"].chunks[0]
-    with _writing(folder), claimed(folder / "standard_error" / "c" / str(number)) as mine:
+    with _writing(folder), claimed(_chunk(folder, number)) as mine:
         if not mine:
             return False
         if np.isfinite(store["standard_error"][part, 0]).all():
