@@ -93,7 +93,9 @@ def run(
             "hidden": list(network.hidden),
             "seconds": round(time.perf_counter() - start, 1),
             "products": sum(a * b for a, b in itertools.pairwise(widths)),
-            "rms": rms({kind: _perceptron(fitted, part) for kind, part in asked.items()}),
+            "rms": rms(
+                {k: _perceptron(fitted, part, network.activation) for k, part in asked.items()}
+            ),
         }
 
     sizes = [Perceptron(hidden, steps, batch, seed=seed) for hidden in perceptrons]
@@ -115,6 +117,8 @@ def run(
 class Adam:
     """Scikit-learn's own perceptron, its rate halved eight times over the steps."""
 
+    activation = "tanh"
+
     def __init__(self, hidden: tuple[int, ...], steps: int, batch: int, seed: int):
         self.hidden, self.steps, self.batch, self.seed = hidden, steps, batch, seed
 
@@ -125,7 +129,7 @@ class Adam:
         x, y = x.astype(np.float32), y.astype(np.float32)
         batch: Any = self.batch
         network: Any = MLPRegressor(
-            hidden_layer_sizes=self.hidden, activation="tanh", batch_size=batch, alpha=0.0,
+            hidden_layer_sizes=self.hidden, activation=self.activation, batch_size=batch, alpha=0.0,
             warm_start=True,
             max_iter=max(round(self.steps * self.batch / len(x) / HALVINGS), 1), tol=0.0,
             n_iter_no_change=10**9, random_state=self.seed,
@@ -138,12 +142,12 @@ class Adam:
         self.coefs_, self.intercepts_ = network.coefs_, network.intercepts_
 
 
-def _perceptron(fitted: dict[str, np.ndarray], x: np.ndarray) -> np.ndarray:
+def _perceptron(fitted: dict[str, np.ndarray], x: np.ndarray, activation: str) -> np.ndarray:
     x = (x - fitted["centre"]) / fitted["scale"]
     layers = sum(name.startswith("weight") for name in fitted)
     for i in range(layers):
         x = x @ fitted[f"weight{i}"] + fitted[f"bias{i}"]
-        x = np.tanh(x) if i < layers - 1 else x
+        x = np.asarray(getattr(jax.nn, activation)(x)) if i < layers - 1 else x
     return x @ fitted["components"] + fitted["mean"]
 
 

@@ -100,6 +100,7 @@ class Member(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     form: str = eqx.field(static=True)
     projected: bool = eqx.field(static=True)  # on an instrument's bands
+    activation: str = eqx.field(static=True)  # of the hidden units, a function of `jax.nn`
     lower: Float[Array, "p"]
     upper: Float[Array, "p"]
     centre: Float[Array, "f"]
@@ -136,7 +137,7 @@ class Member(eqx.Module):
         for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
             x = jnp.matmul(x, w, precision=PRECISION) + b.reshape(like)
             if i < len(self.weights) - 1:
-                x = jnp.tanh(x)
+                x = getattr(jax.nn, self.activation)(x)
         if self.components is not None:
             x = jnp.matmul(x, self.components, precision=PRECISION)
         log = x + self.mean.reshape(like)
@@ -540,6 +541,7 @@ def _member(form: str, arrays: dict[str, np.ndarray], about: dict[str, Any]) -> 
         names=tuple(about["names"]),
         form=form,
         projected=False,
+        activation=str(about.get("activation", "tanh")),
         lower=jnp.asarray(arrays["lower"], jnp.float32),
         upper=jnp.asarray(arrays["upper"], jnp.float32),
         centre=get("centre"),

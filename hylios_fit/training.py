@@ -66,7 +66,7 @@ FIRST = 3e-3
 """Hits in a straight pass that free the light which total reflection keeps in a clear epidermis."""
 LOCAL_HIDDEN = (256, 256, 256)
 LOCAL_STEPS = 40_000
-LOCAL_BATCH = 2048
+LOCAL_BATCH = 1024
 ALIKE = 100.0  # entries of a walked table whose noise is as good as one: they share paths
 TRUST = 1e-3  # error of the logarithm that rows without noise are learned to, about
 FINE_ORDER = 12  # of usual slopes, and of what else is solved more finely
@@ -79,10 +79,10 @@ LEAST = {True: 0.025, False: 0.003}
 LOOKED_AT = 384  # specimens that say how much it does
 SPECIMENS = 131_072  # of each form, that the local regression answers for
 COMPONENTS = 80
-SIZES = {"large": ((256, 256, 192), 100_000), "small": ((192, 128, 128), 120_000)}
+SIZES = {"large": ((256, 256, 192), 40_000), "small": ((192, 128, 128), 60_000)}
 """Hidden units and steps: whole spectra leave time for the first, few bands need the second."""
 BATCH = 1024
-SEEN, EMPHASIS = (380.0, 720.0), 2.0  # nm; errors count so much more where the eye sees them
+SEEN, EMPHASIS = (380.0, 720.0), 3.0  # nm; errors count so much more where the eye sees them
 CORNERS = 0.25  # what a specimen from all over the box weighs: the hardest, and few fits are there
 LEAST_ROWS = 64  # of each form
 CHECK_ORDER = 8  # of the solver that they are held against
@@ -165,6 +165,7 @@ def _trained(
         "seed": seed,
         "size": size,
         "depth": len(SIZES[size][0]) + 1,
+        "activation": Perceptron().activation,
         "held_out": f"{checks} fresh specimens of each form, by adding-doubling",
         "held_out_rms": {},
         "held_out_most": {},

@@ -684,7 +684,7 @@ def test_corners_of_the_box_count_less():
 
 def test_errors_that_the_eye_sees_count_more_and_nothing_else_changes():
     scale = training.emphasis(np.array([300.0, 380.0, 550.0, 720.0, 725.0]))
-    np.testing.assert_array_equal(scale, np.array([1.0, 2.0, 2.0, 2.0, 1.0]))
+    np.testing.assert_array_equal(scale, np.array([1.0, 3.0, 3.0, 3.0, 1.0]))
 
     class Linear:
         def fit(self, x, y):
