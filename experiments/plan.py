@@ -34,6 +34,7 @@ TOLERANCES = (0.02, 0.005, 0.002, 0.0005)
 FRESH = 24
 TRUTH = 8
 TIMED = 32  # specimens at once
+MARKERS = {"solver": "D", "large surrogate": "o", "small surrogate": "s"}
 MODULES = (*_shared.WALK, "adding", "planning", "simulation", "streams", "surrogate", "table")
 
 
@@ -139,13 +140,16 @@ def draw(result: dict[str, Any], path: Any) -> None:
         errors.plot(tolerances, [s["error"] for s in steps], "o-", color=colour, label=name)
         errors.plot(tolerances, [s["rms"] for s in steps], "o:", color=colour, mfc="white", lw=1)
         gain = [scene["seconds"] / s["seconds"] for s in steps]
-        times.plot(tolerances, gain, "o-", color=colour, label=name)
+        times.plot(tolerances, gain, "-", color=colour, label=name)
         for tolerance, s, at in zip(tolerances, steps, gain, strict=True):
-            text = s["size"] if s["method"] == "surrogate" else f"{s['wavelengths']}"
-            times.annotate(
-                text, (tolerance, at), (0, 6), textcoords="offset points", fontsize=8,
-                color=colour, ha="center",
-            )  # fmt: skip
+            solved = s["method"] != "surrogate"
+            shape = MARKERS["solver" if solved else f"{s['size']} surrogate"]
+            times.plot(tolerance, at, shape, color=colour)
+            if solved:
+                times.annotate(
+                    f"{s['wavelengths']}", (tolerance, at), (-8, 0), textcoords="offset points",
+                    fontsize=8, color=colour, ha="right", va="center",
+                )  # fmt: skip
         _dropped(figure.add_subplot(grid[1, i]), name, steps)
     errors.plot(tolerances, tolerances, color="black", lw=1, ls="--", label="tolerance")
     for axes in (errors, times):
@@ -154,6 +158,9 @@ def draw(result: dict[str, Any], path: Any) -> None:
         axes.set_xticks(tolerances, [f"{t:g}" for t in tolerances])
         axes.minorticks_off()
     errors.legend(fontsize=8.5)
+    kinds = [times.plot([], [], m, color="black", label=n)[0] for n, m in MARKERS.items()]
+    times.legend(handles=kinds, fontsize=8.5)
+    times.margins(x=0.12)
     _shared.logarithmic(times.yaxis)
     _shared.tidy(
         errors, "tolerance (reflectance)", "error on fresh specimens",
@@ -161,7 +168,7 @@ def draw(result: dict[str, Any], path: Any) -> None:
     )  # fmt: skip
     _shared.tidy(
         times, "tolerance (reflectance)", "times faster than everything at order 8",
-        "time saved, with the surrogate or the number of wavelengths solved",
+        "time saved; numbers: wavelengths that are solved",
     )  # fmt: skip
     _shared.save_figure(figure, path)
 

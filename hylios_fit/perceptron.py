@@ -4,8 +4,7 @@ What is learned here is smooth and known to many digits. Adam alone, which sciki
 perceptron has, creeps along the narrow valleys of such a task. SOAP (Vyas et al. 2024,
 arXiv:2409.11321) runs Adam along the eigenvectors of the second moments of each matrix's gradient,
 those of Shampoo (Gupta et al. 2018, arXiv:1802.09568), where the valleys hardly mix. Its settings
-are those of the paper: with longer memories and fewer turns, and tanh for silu, five times as many
-steps came as far.
+are those of the paper.
 """
 
 from __future__ import annotations

@@ -53,6 +53,7 @@ FEATURES_NM = np.array(
 )
 """Wavelengths at which the features hold how deep the layers are, optically."""
 DETOUR = 1.64  # bounces inside melanosomes make light absorbed weakly that much longer
+ACTIVATIONS = "silu", "tanh"  # of hidden units, functions of `jax.nn`
 FAINT = 3e-3  # optical depth that is as good as none
 SLACK = 1e-5  # of the box's width, for rounding
 BLOCK = 4096  # rows of a batch of more than four blocks: what they need stays in the cache
@@ -100,7 +101,7 @@ class Member(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     form: str = eqx.field(static=True)
     projected: bool = eqx.field(static=True)  # on an instrument's bands
-    activation: str = eqx.field(static=True)  # of the hidden units, a function of `jax.nn`
+    activation: str = eqx.field(static=True)
     lower: Float[Array, "p"]
     upper: Float[Array, "p"]
     centre: Float[Array, "f"]
@@ -508,6 +509,10 @@ def _load_cached(path: Path, stamp: tuple[int, int]) -> Surrogate:
             f"{path} has version {about.get('format_version')} of the surrogate's format, this "
             f"hylios_fit reads version {FORMAT_VERSION}: {again}"
         )
+    if _activation(about) not in ACTIVATIONS:
+        raise HyliosError(
+            f"{path}: the activation is one of {', '.join(ACTIVATIONS)}, got {_activation(about)!r}"
+        )
     if about.get("sha256") != digest(arrays):
         raise HyliosError(f"{path} is damaged: its numbers do not match their hash")
     return assemble(arrays, about)
@@ -532,6 +537,10 @@ def _load(path: Path) -> Surrogate:
     return _load_cached(path, (stat.st_mtime_ns, stat.st_size))
 
 
+def _activation(about: dict[str, Any]) -> str:
+    return about.get("activation", "tanh")  # files of before it was said
+
+
 def _member(form: str, arrays: dict[str, np.ndarray], about: dict[str, Any]) -> Member:
     def get(name: str) -> Array:
         return jnp.asarray(arrays[f"{form}/{name}"], jnp.float32)
@@ -541,7 +550,7 @@ def _member(form: str, arrays: dict[str, np.ndarray], about: dict[str, Any]) -> 
         names=tuple(about["names"]),
         form=form,
         projected=False,
-        activation=str(about.get("activation", "tanh")),
+        activation=_activation(about),
         lower=jnp.asarray(arrays["lower"], jnp.float32),
         upper=jnp.asarray(arrays["upper"], jnp.float32),
         centre=get("centre"),

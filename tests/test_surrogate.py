@@ -315,6 +315,28 @@ def rewritten(tmp_path, change):
     return path
 
 
+@pytest.mark.parametrize("size", ["large", "small"])
+def test_it_evaluates_what_the_file_says(size):
+    """Its numbers multiplied out in NumPy, in double precision."""
+    with np.load(data_path(module.EMBEDDED[size]), allow_pickle=False) as file:
+        arrays = {name: file[name].astype(float) for name in file.files if name != "about"}
+        about = json.loads(file["about"].tobytes())
+    bend = {"silu": lambda x: x / (1.0 + np.exp(-x)), "tanh": np.tanh}[
+        about.get("activation", "tanh")
+    ]
+    member = load_surrogate(size=size).at("dispersed")
+    rows = np.random.default_rng(0).uniform(member.lower, member.upper, (20, len(member.names)))
+    get = {name.partition("/")[2]: a for name, a in arrays.items() if name.startswith("dispersed/")}
+    x = np.asarray(module.features(member.names, "dispersed", jnp.asarray(rows, jnp.float32)))
+    x = (x - get["centre"]) / get["scale"]
+    for i in range(about["depth"]):
+        x = (bend(x) if i else x) @ get[f"weight{i}"] + get[f"bias{i}"]
+    inside = np.exp(x @ get["components"] + get["mean"]) - module.FLOOR
+    found = np.asarray(member(jnp.asarray(rows, jnp.float32)))
+    surface = np.asarray(member.surface_at(rows.astype(np.float32)))
+    np.testing.assert_allclose(found, surface + (1.0 - surface) * inside, atol=2e-5)
+
+
 def test_a_file_cut_in_half_is_an_error(tmp_path):
     whole = data_path("surrogate.npz").read_bytes()
     path = tmp_path / "half.npz"
@@ -339,6 +361,12 @@ def test_other_files_are_errors(tmp_path):
 
     with pytest.raises(HyliosError, match="but not a hylios_fit surrogate"):
         load_surrogate(rewritten(tmp_path, other_format))
+
+    def other_units(_, about):
+        about["activation"] = "relu"
+
+    with pytest.raises(HyliosError, match="activation is one of silu, tanh, got 'relu'"):
+        load_surrogate(rewritten(tmp_path, other_units))
 
     def one_number(arrays, _):
         arrays["complex/mean"] = arrays["complex/mean"] + 1e-3
