@@ -79,7 +79,7 @@ LEAST = {True: 0.025, False: 0.003}
 LOOKED_AT = 384  # specimens that say how much it does
 SPECIMENS = 131_072  # of each form, that the local regression answers for
 COMPONENTS = 80
-SIZES = {"large": ((256, 256, 192), 30_000), "small": ((128, 96, 64), 40_000)}
+SIZES = {"large": ((256, 256, 192), 30_000), "small": ((192, 128, 128), 40_000)}
 """Hidden units and steps: whole spectra leave time for the first, few bands need the second."""
 BATCH = 1024
 SEEN, EMPHASIS = (380.0, 720.0), 3.0  # nm; errors count so much more where the eye sees them
