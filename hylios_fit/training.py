@@ -72,6 +72,7 @@ TRUST = 1e-3  # error of the logarithm that rows without noise are learned to, a
 FINE_ORDER = 12  # of usual slopes, and of what else is solved more finely
 FINE = 256  # specimens of each form that are solved at both orders
 ORDER_STEPS = 4000
+NEAR = 2048  # specimens of each form, every parameter free, that add to the table's rows
 STEEP = 256, 128  # specimens of each form whose slopes are solved: usual ones free, every one free
 WAYS = 4, 8  # in which each of them is looked at
 LEAST = {True: 0.025, False: 0.003}
@@ -378,7 +379,9 @@ class Finer(NamedTuple):
     rows: Float[np.ndarray, "n P"]
     coarse: Float[np.ndarray, "n w"]  # reflectance as the table would have it
     fine: Float[np.ndarray, "n w"]
-    slopes: tuple[Slopes, ...]  # of other specimens
+    near: tuple[Float[np.ndarray, "m P"], Float[np.ndarray, "m w"]]
+    """Other specimens, from the prior, and their reflectance as the table would have it."""
+    slopes: tuple[Slopes, ...]  # of others still
 
 
 def solve_slopes(
@@ -408,8 +411,9 @@ def solve_finer(
     steps: Checkpoints | None = None,
 ) -> Finer:  # fmt: skip
     """Reflectances of `fresh` specimens, half with the usual parameters free and half with every
-    one; and the slopes of some that are `asked`, with the usual ones free, and of others with every
-    one. `bar` counts `STAGES` of each of the three, `steps` keep them.
+    one; those of more with every one, where the table's rows, spread over the box, lie far apart;
+    and the slopes of some that are `asked`, with the usual ones free, and of others with every one.
+    `bar` counts `STAGES` of each of the four, `steps` keep them.
     """
 
     def step(name: str) -> Step | None:
@@ -418,10 +422,15 @@ def solve_finer(
     box = names, _, _ = box_of(table)
     key = jax.random.fold_in(jax.random.key(seed), 5)
     rows = np.concatenate([fresh(*box, FINE // 2, key), fresh(*box, FINE // 2, key, names)])
-    lots = [rows[i : i + TOGETHER] for i in range(0, FINE, TOGETHER)]
-    orders = {"coarse": ADDING_ORDER, "fine": FINE_ORDER}
 
-    def solve() -> dict[str, np.ndarray]:
+    def free(count: int, number: int) -> np.ndarray:
+        drawn = fresh(*box, count, jax.random.fold_in(jax.random.key(seed), number), names)
+        # a wavelength sees its own indices alone, whatever those of the others
+        drawn[:, [names.index(name) for name in FURTHER]] = 0.0
+        return drawn
+
+    def solve(rows: np.ndarray, **orders: int) -> dict[str, np.ndarray]:
+        lots = [rows[i : i + TOGETHER] for i in range(0, len(rows), TOGETHER)]
         found = [
             [solve_rows(names, lot, form, n) for n in orders.values()]
             for lot in _in_stages(lots, bar)
@@ -429,16 +438,16 @@ def solve_finer(
         parts = (np.concatenate(part) for part in zip(*found, strict=True))
         return dict(zip(orders, parts, strict=True))
 
-    both = _once(step("order"), solve, bar)
+    both = _once(step("order"), partial(solve, rows, coarse=ADDING_ORDER, fine=FINE_ORDER), bar)
+    near = free(NEAR, 7)
+    light = _once(step("near"), partial(solve, near, coarse=ADDING_ORDER), bar)["coarse"]
     usual, every = STEEP
-    steep = fresh(*box, every, jax.random.fold_in(jax.random.key(seed), 6), names)
-    # a wavelength sees its own indices alone, whatever those of the others
-    steep[:, [names.index(name) for name in FURTHER]] = 0.0
+    steep = free(every, 6)
     slopes = (
         solve_slopes(names, form, asked[_prior(len(asked)) :][:usual], bar, step=step("usual")),
         solve_slopes(names, form, steep, bar, every=True, step=step("every")),
     )
-    return Finer(names, rows, both["coarse"], both["fine"], slopes)
+    return Finer(names, rows, both["coarse"], both["fine"], (near, light), slopes)
 
 
 def _once(
@@ -530,6 +539,9 @@ def learn_locally(
     weight = (weight * seen).reshape(-1)
     x, y, along = (x - centre) / scale, log.reshape(-1, 1), None
     if finer is not None:
+        near, light = finer.near
+        x = np.concatenate([x, (_examples(finer.names, form, near) - centre) / scale])
+        y = np.concatenate([y, _from_inside(finer.names, near, light)[1].reshape(-1, 1)])
         y = y + _order(finer, form, centre, scale, seed)(x)
         generator = np.random.default_rng([seed, 3])
         lots = [
@@ -540,7 +552,7 @@ def learn_locally(
         inputs, logs, *changes = (np.concatenate(part) for part in zip(*lots, strict=True))
         along = changes[0] / scale, changes[1] / unit
         x, y = np.concatenate([x, (inputs - centre) / scale]), np.concatenate([y, logs])
-        weight = np.concatenate([weight, np.resize(seen, len(logs))])  # wavelength by wavelength
+        weight = np.concatenate([weight, np.resize(seen, len(y) - len(weight))])
     y = (y - middle) / unit
     network = Perceptron(
         LOCAL_HIDDEN, steps or LOCAL_STEPS, LOCAL_BATCH, variance=variance, seed=seed, bar=bar,
@@ -638,7 +650,7 @@ def _fits(
     exact = table.attrs["generator"] == "adding"
     with (
         tqdm(
-            total=(2 + 3 * exact) * len(forms) * STAGES, desc="train", unit="stage",
+            total=(2 + 4 * exact) * len(forms) * STAGES, desc="train", unit="stage",
             disable=not progress,
         ) as stages,
         one_blas_thread(),

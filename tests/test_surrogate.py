@@ -600,7 +600,8 @@ def finer_of(table, form, asked=None, seed=0, bar=None):
     drawn, *steep = (training.fresh(*box, n, jax.random.key(n)) for n in (64, 48, 16))
     coarse = stand_in(names, form, drawn)
     slopes = tuple(slopes_of(names, form, rows) for rows in steep)
-    return training.Finer(names, drawn, coarse, MORE * coarse, slopes)
+    near = drawn[:8], coarse[:8]
+    return training.Finer(names, drawn, coarse, MORE * coarse, near, slopes)
 
 
 def test_a_finer_order_and_slopes_are_learned_beyond_the_table(tmp_path, quick):
@@ -627,6 +628,38 @@ def test_a_finer_order_and_slopes_are_learned_beyond_the_table(tmp_path, quick):
     assert abs(more[0] - MORE) < 0.001
     assert abs(more[1] - 1.0) < 0.005
     assert off[0] < 0.5 * off[1]
+
+
+def test_specimens_near_by_are_learned_as_rows_of_the_table_are(tmp_path, quick, monkeypatch):
+    """Each is given to the network beside the table's, with what the finer order adds."""
+    filled(tmp_path / "table.zarr", 128)
+    rows = table.read_table(tmp_path / "table.zarr")
+    finer = finer_of(rows, "dispersed")
+    near = training.fresh(*training.box_of(rows), 32, jax.random.key(9))
+    light = 1.1 * stand_in(finer.names, "dispersed", near)
+    given = []
+
+    def fit(self, x, y, weight, along):
+        given.append((x, y, weight, along))
+        return self
+
+    monkeypatch.setattr(training.Perceptron, "fit", fit)
+    monkeypatch.setattr(training, "_order", lambda *_: lambda x: 0.5)
+    for few in (16, 32):
+        part = finer._replace(near=(near[:few], light[:few]))
+        local = training.learn_locally(rows, "dispersed", finer=part)
+    (x, y, weight, along), (more_x, more_y, more_weight, same) = given
+    first = int(np.sum(rows["form"].values == 1)) * 451
+    added = np.r_[first + 16 * 451 : first + 32 * 451]
+    assert len(more_x) == len(more_y) == len(more_weight) == len(x) + len(added)
+    for every, without in ((more_x, x), (more_y, y), (more_weight, weight)):
+        np.testing.assert_allclose(np.delete(every, added, axis=0), without, rtol=1e-6)
+    inside = training._from_inside(finer.names, near, light)[1]
+    found = more_y[first : first + 32 * 451] * local.unit + local.middle
+    np.testing.assert_allclose(found, inside.reshape(-1, 1) + 0.5, rtol=1e-5)
+    seen = training.emphasis(table.WAVELENGTHS) ** 2
+    np.testing.assert_allclose(more_weight[added[:451]], seen / seen.mean(), rtol=1e-6)
+    np.testing.assert_array_equal(same[0], along[0])
 
 
 @pytest.mark.parametrize("generator", table.GENERATORS)
@@ -675,10 +708,10 @@ def test_what_is_solved_more_finely(tmp_path, monkeypatch):
     asked = training.specimens(rows, 0, 2000)
     steps = Checkpoints(tmp_path, {})
     finer = training.solve_finer(rows, "dispersed", asked, bar=(bar := Bar()), steps=steps)
-    assert bar.count == 3 * training.STAGES
+    assert bar.count == 4 * training.STAGES
     solved = len(orders)
     again = training.solve_finer(rows, "dispersed", asked, bar=bar, steps=steps)
-    assert (bar.count, len(orders)) == (6 * training.STAGES, solved)
+    assert (bar.count, len(orders)) == (8 * training.STAGES, solved)
     np.testing.assert_array_equal(again.fine, finer.fine)
     for part, same in zip(finer.slopes, again.slopes, strict=True):
         np.testing.assert_array_equal(part.slopes, same.slopes)
@@ -687,6 +720,13 @@ def test_what_is_solved_more_finely(tmp_path, monkeypatch):
     np.testing.assert_array_equal(finer.fine, 2 * finer.coarse)
     usual = (finer.rows[:, table.USUAL :] == finer.rows[0, table.USUAL :]).all(axis=1)
     assert np.flatnonzero(usual).tolist() == list(range(training.FINE // 2))
+    near, light = finer.near
+    assert len(near) == training.NEAR
+    np.testing.assert_array_equal(light[:, 0], 6 * near[:, water])
+    assert np.flatnonzero(np.ptp(near, axis=0) == 0.0).tolist() == [
+        finer.names.index("index_dispersion")
+    ]
+    np.testing.assert_array_equal(again.near[1], light)
     # from the prior with the usual parameters free, and with every one
     some, every = finer.slopes
     assert orders == [12] * len(some.rows) + [8] * len(every.rows)
