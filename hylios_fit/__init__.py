@@ -7,6 +7,7 @@ Data flows one way through the modules; each imports only from those above it:
     files        written whole or not at all
     checkpoints  steps of a long computation, kept until its output is written
     threads      linear algebra held to one thread
+    precision    products of matrices in full precision on every device
     counter      random words from a counter
     datasets     find, read and check what is in data/
     absorbers    specific absorption spectra

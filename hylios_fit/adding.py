@@ -23,7 +23,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -36,6 +37,7 @@ from numpy.polynomial import Chebyshev, Polynomial
 
 from hylios_fit import streams
 from hylios_fit.errors import HyliosError
+from hylios_fit.precision import HIGHEST
 from hylios_fit.skin import LAYERS, Layers, Specimen, let_stand
 from hylios_fit.skin import layers as layers_of
 from hylios_fit.streams import SAME, Streams
@@ -640,9 +642,12 @@ def _surfaces(sets, indices, outside, roughness, incidence, order) -> list[strea
     return [streams.Surface(*row) for row in zip(*parts, strict=True)]
 
 
-def _precision(dtype: Any) -> Any:
-    """Double precision where it is asked for, and where JAX is set to it."""
-    return jax.enable_x64(np.float64 in (dtype, jax.dtypes.canonicalize_dtype(np.float64)))
+@contextmanager
+def _precision(dtype: Any) -> Iterator[None]:
+    """Double precision where it is asked for, and where JAX is set to it; products in full."""
+    wide = np.float64 in (dtype, jax.dtypes.canonicalize_dtype(np.float64))
+    with jax.enable_x64(wide), jax.default_matmul_precision(HIGHEST):
+        yield
 
 
 def _concrete(name: str, value: Any) -> np.ndarray:

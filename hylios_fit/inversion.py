@@ -36,6 +36,7 @@ from jaxtyping import Array, Float
 
 from hylios_fit import instrument, statevector
 from hylios_fit.errors import HyliosError
+from hylios_fit.precision import in_full
 from hylios_fit.results import MISSING, QUANTITIES, Estimate, Fit, Outcome
 from hylios_fit.spectra import Spectra, as_spectra
 from hylios_fit.threads import one_blas_thread
@@ -339,6 +340,7 @@ def _spectra(
 
 
 @eqx.filter_jit
+@in_full
 def _solve(
     member: Any,
     vector: statevector.StateVector,

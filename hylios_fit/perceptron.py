@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from sklearn.base import BaseEstimator, RegressorMixin
 
 from hylios_fit.checkpoints import Step
+from hylios_fit.precision import product
 
 TURN = 10  # steps between two turns of the eigenvectors
 WARM = 0.02  # share of the steps in which the rate rises; after it falls as a cosine does
@@ -172,12 +173,11 @@ def _forward(matrices: list[Array], x: Float[Array, "n f"], activation: str) -> 
     bend = getattr(jax.nn, activation)
     for i, matrix in enumerate(matrices):
         x = bend(x) if i else x
-        x = _times(x, matrix[:-1]) + matrix[-1][None]
+        x = product(x, matrix[:-1]) + matrix[-1][None]
     return x
 
 
 _answer = jax.jit(_forward, static_argnames="activation")
-_times = partial(jnp.matmul, precision="highest")
 
 
 def _loss(
@@ -238,17 +238,17 @@ def _descend(
 
 
 def _move(layer: _Layer, gradient: Array, count: Array, size: Array) -> _Layer:
-    along = _times(_times(layer.rows.T, gradient), layer.columns)
+    along = product(product(layer.rows.T, gradient), layer.columns)
     first = FIRST * layer.first + (1.0 - FIRST) * along
     second = SECOND * layer.second + (1.0 - SECOND) * along**2
     mean, square = first / (1.0 - FIRST**count), second / (1.0 - SECOND**count)
-    step = _times(_times(layer.rows, mean / (jnp.sqrt(square) + TINY)), layer.columns.T)
+    step = product(product(layer.rows, mean / (jnp.sqrt(square) + TINY)), layer.columns.T)
     return layer._replace(
         matrix=layer.matrix - size * step,
         first=first,
         second=second,
-        left=TURNING * layer.left + (1.0 - TURNING) * _times(gradient, gradient.T),
-        right=TURNING * layer.right + (1.0 - TURNING) * _times(gradient.T, gradient),
+        left=TURNING * layer.left + (1.0 - TURNING) * product(gradient, gradient.T),
+        right=TURNING * layer.right + (1.0 - TURNING) * product(gradient.T, gradient),
     )
 
 
@@ -256,14 +256,14 @@ def _turned(layer: _Layer) -> _Layer:
     """With eigenvectors one orthogonal iteration closer, the largest first."""
 
     def closer(moments: Array, vectors: Array) -> tuple[Array, Array]:
-        size = jnp.sum(vectors * _times(moments, vectors), axis=0)
+        size = jnp.sum(vectors * product(moments, vectors), axis=0)
         order = jnp.argsort(-size)
-        return jnp.linalg.qr(_times(moments, vectors[:, order]))[0], order
+        return jnp.linalg.qr(product(moments, vectors[:, order]))[0], order
 
     rows, top = closer(layer.left, layer.rows)
     columns, side = closer(layer.right, layer.columns)
-    first = _times(
-        _times(_times(rows.T, layer.rows), layer.first), _times(layer.columns.T, columns)
+    first = product(
+        product(product(rows.T, layer.rows), layer.first), product(layer.columns.T, columns)
     )
     second = layer.second[top][:, side]
     return layer._replace(rows=rows, columns=columns, first=first, second=second)

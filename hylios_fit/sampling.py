@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 
 from hylios_fit import inversion, statevector
 from hylios_fit.errors import HyliosError
+from hylios_fit.precision import in_full
 from hylios_fit.results import QUANTITIES, Fit, Posterior
 from hylios_fit.threads import one_blas_thread
 
@@ -147,6 +148,7 @@ def _log_posterior(static: Any) -> Callable[[Any, Array], Array]:
     """
 
     @jax.jit
+    @in_full
     def density(dynamic: Any, states: Float[Array, "S N"]) -> Float[Array, " S"]:
         member, vector, weights, target = eqx.combine(dynamic, static)
 

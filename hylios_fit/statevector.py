@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hylios_fit.errors import HyliosError
+from hylios_fit.precision import product
 from hylios_fit.skin import SPECS, STRATA
 
 
@@ -146,7 +147,7 @@ class StateVector(eqx.Module):
     def u(self, z: Float[Array, "... N"]) -> Float[Array, "... N"]:
         """The unbounded variables of the free parameters."""
         z = jnp.asarray(z)
-        u = z @ jnp.asarray(self.factor.T, z.dtype)
+        u = product(z, jnp.asarray(self.factor.T, z.dtype))
         return u + jnp.broadcast_to(jnp.asarray(self.mean, z.dtype), u.shape)
 
     def from_u(self, u: Float[Array, "... N"]) -> Float[Array, "... N"]:

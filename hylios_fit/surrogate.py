@@ -27,6 +27,7 @@ from jaxtyping import Array, Float
 from hylios_fit import datasets, melanosome, skin
 from hylios_fit.errors import HyliosError
 from hylios_fit.files import load_arrays, save_arrays
+from hylios_fit.precision import product
 from hylios_fit.skin import LAYERS, SPECS, STRATA, Specimen
 
 FORMAT = "hylios_fit surrogate"
@@ -57,7 +58,6 @@ ACTIVATIONS = "silu", "tanh"  # of hidden units, functions of `jax.nn`
 FAINT = 3e-3  # optical depth that is as good as none
 SLACK = 1e-5  # of the box's width, for rounding
 BLOCK = 4096  # rows of a batch of more than four blocks: what they need stays in the cache
-PRECISION = "highest"  # some accelerators multiply float32 with 10 bits unless told not to
 
 
 def features(
@@ -136,11 +136,11 @@ class Member(eqx.Module):
         x = features(self.names, self.form, bounded)
         x = (x - self.centre.reshape(like)) / self.scale.reshape(like)
         for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = jnp.matmul(x, w, precision=PRECISION) + b.reshape(like)
+            x = product(x, w) + b.reshape(like)
             if i < len(self.weights) - 1:
                 x = getattr(jax.nn, self.activation)(x)
         if self.components is not None:
-            x = jnp.matmul(x, self.components, precision=PRECISION)
+            x = product(x, self.components)
         log = x + self.mean.reshape(like)
         surface = self._surface(bounded)
         bands = self._read(surface + (1.0 - surface) * (jnp.exp(log) - FLOOR))
@@ -149,7 +149,7 @@ class Member(eqx.Module):
     def _read(self, columns: Float[Array, "... c"]) -> Float[Array, "... b"]:
         if self.readout is None:
             return columns
-        return jnp.matmul(columns, self.readout, precision=PRECISION)
+        return product(columns, self.readout)
 
     def surface_at(self, parameters: Any) -> Float[Array, "... b"]:
         """What the surface reflects at once: what an instrument with a gloss trap does not see."""
@@ -248,8 +248,8 @@ class Member(eqx.Module):
         components, weights_, biases = self.components[:, used], self.weights, self.biases
         wide, kept = weights_[-1].shape
         if wide * used.size <= (wide + used.size) * kept:  # one product is less work than two
-            weights_ = (*weights_[:-1], _product(weights_[-1], components))
-            biases = (*biases[:-1], _product(biases[-1], components))
+            weights_ = (*weights_[:-1], _at_once(weights_[-1], components))
+            biases = (*biases[:-1], _at_once(biases[-1], components))
             components = None
         # errors of the logarithm add up by what it was taken of
         share = w * np.exp(np.asarray(self.mean, float))
@@ -388,7 +388,7 @@ class Surrogate(eqx.Module):
         return weights @ np.asarray(member(jnp.asarray(parameters[:-1], jnp.float32)), float)
 
 
-def _product(a: Array, b: Array) -> Array:
+def _at_once(a: Array, b: Array) -> Array:
     return jnp.asarray(np.asarray(a, float) @ np.asarray(b, float), a.dtype)
 
 

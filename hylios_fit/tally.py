@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hylios_fit.precision import HIGHEST, product
 from hylios_fit.skin import Layers
 from hylios_fit.walker import (
     ENDS,
@@ -115,9 +116,6 @@ def _of(kind: Array, kinds: int, dtype: Any) -> Array:
     return (kind[:, None] == jnp.arange(kinds, dtype=kind.dtype)[None]).astype(dtype)
 
 
-_product = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
-
-
 def _weights(weigher: _Weigher, paths: Paths) -> Array:
     """(ray, w)"""
     return _wanted(weigher, paths, _mixed(weigher, paths)[0])
@@ -135,17 +133,17 @@ def _mixed(weigher: _Weigher, paths: Paths) -> tuple[Array, Array]:
 
 def _walked(weigher: _Weigher, paths: Paths) -> Array:
     """(ray, k): logarithm of the density of each path under each column."""
-    each = _product(paths.sums, weigher.walked)
+    each = product(paths.sums, weigher.walked)
     if weigher.ends is None:
         return each
-    return each + _product(_of(paths.end, ENDS, each.dtype), weigher.ends)
+    return each + product(_of(paths.end, ENDS, each.dtype), weigher.ends)
 
 
 def _wanted(weigher: _Weigher, paths: Paths, unit: Array) -> Array:
     """(ray, w): density of each path that came back, where exp(`unit`) is 1."""
     if weigher.nodes is not None:
         nodes = jnp.asarray(NODES, unit.dtype)
-        angles = _product(paths.sums, angle_density(nodes))
+        angles = product(paths.sums, angle_density(nodes))
         largest = jnp.max(angles, axis=1)
         angles = jnp.exp(angles - largest[:, None])
         unit = unit - largest
@@ -153,8 +151,8 @@ def _wanted(weigher: _Weigher, paths: Paths, unit: Array) -> Array:
     unit = jnp.where(paths.escaped > 0, unit, -NEVER)
     one = jnp.ones((1, weigher.asked.shape[1]), weigher.asked.dtype)
     columns = jnp.concatenate([paths.sums, -unit[:, None]], axis=1)
-    density = jnp.exp(_product(columns, jnp.concatenate([weigher.asked, one])))
-    return density if weigher.nodes is None else density * _product(angles, weigher.nodes)
+    density = jnp.exp(product(columns, jnp.concatenate([weigher.asked, one])))
+    return density if weigher.nodes is None else density * product(angles, weigher.nodes)
 
 
 def _own_weights(weigher: _Weigher, paths: Paths) -> Array:
@@ -170,7 +168,7 @@ def _sum_own_weights(weigher: _Weigher, paths: Paths, columns: int) -> tuple[Arr
     def part(carry, chunk):
         weight = _own_weights(weigher, chunk)
         lots = jnp.stack([weight, jax.lax.stop_gradient(weight) ** 2], axis=1)
-        return carry + _product(_of(chunk.hero, columns, lots.dtype).T, lots), None
+        return carry + product(_of(chunk.hero, columns, lots.dtype).T, lots), None
 
     zero = jnp.zeros((columns, 2), weigher.asked.dtype)
     total, _ = jax.lax.scan(part, zero, _chunks(paths))
@@ -268,7 +266,7 @@ def _sums(weigher: _Weigher, paths: Paths, sent: Array, slopes: bool = False) ->
     def known_so_far(carry, count, c):
         rays, beyond, beyond2 = carry
         scaled = c / jnp.maximum(count, 1.0)[:, None]
-        return rays + jnp.sum(count), beyond + jnp.sum(c, axis=0), beyond2 + _product(c.T, scaled)
+        return rays + jnp.sum(count), beyond + jnp.sum(c, axis=0), beyond2 + product(c.T, scaled)
 
     factor = None
     if slopes and known:
@@ -291,8 +289,8 @@ def _sums(weigher: _Weigher, paths: Paths, sent: Array, slopes: bool = False) ->
             counts = weight
             if factor is not None:
                 level, tilt = factor
-                counts = weight * jnp.repeat(level[f] - _product(scaled, tilt[f]), group)[:, None]
-            by_sum = by_sum + _product(chunk.sums.T, counts)
+                counts = weight * jnp.repeat(level[f] - product(scaled, tilt[f]), group)[:, None]
+            by_sum = by_sum + product(chunk.sums.T, counts)
         rays, beyond, beyond2 = known_so_far((carry.rays, carry.beyond, carry.beyond2), count, c)
         return _Sums(
             rays,
@@ -301,7 +299,7 @@ def _sums(weigher: _Weigher, paths: Paths, sent: Array, slopes: bool = False) ->
             carry.squares + jnp.sum(w**2 * inverse, axis=0),
             beyond,
             beyond2,
-            carry.cross + _product(scaled.T, w),
+            carry.cross + product(scaled.T, w),
             by_sum,
         )
 
@@ -344,16 +342,16 @@ def _steadied(sums: _Sums) -> tuple[Array, Array, Array]:
         _others(x) for x in (sums.rays, sums.beyond, sums.weight, sums.cross)
     )
     cross = cross - beyond[..., None] * (light / jnp.maximum(rays, 1.0)[:, None])[:, None]
-    controls = jnp.matmul(_inverses(sums.rays, sums.beyond2), cross, precision="highest")
-    weight = weight - jnp.einsum("fk,fkw->w", sums.beyond, controls, precision="highest")
-    twice = jnp.matmul(sums.beyond2, controls, precision="highest") - 2.0 * sums.cross
+    controls = product(_inverses(sums.rays, sums.beyond2), cross)
+    weight = weight - jnp.einsum("fk,fkw->w", sums.beyond, controls, precision=HIGHEST)
+    twice = product(sums.beyond2, controls) - 2.0 * sums.cross
     return weight, weight2, squares + jnp.sum(twice * controls, axis=(0, 1))
 
 
 def _factors(rays: Array, beyond: Array, beyond2: Array) -> tuple[Array, Array]:
     """What the weights of a group count in `_steadied`'s sum, which is linear in them: so much by
     fold (f,), less (f, k) times what the columns have beyond their shares, by ray."""
-    tilt = jnp.einsum("fkl,fl->fk", _inverses(rays, beyond2), beyond, precision="highest")
+    tilt = jnp.einsum("fkl,fl->fk", _inverses(rays, beyond2), beyond, precision=HIGHEST)
     level = jnp.sum(tilt * _others(beyond), axis=1) / jnp.maximum(_others(rays), 1.0)
     return 1.0 + _others(level), _others(tilt)
 
@@ -428,27 +426,27 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> Arra
     mean_of = sent / jnp.maximum(jnp.sum(sent, axis=0, keepdims=True), 1.0)
 
     def about_mean(x):
-        return x - _product(sent, _product(mean_of.T, x))
+        return x - product(sent, product(mean_of.T, x))
 
     def rest(now):
         """What each ray counts, and what its weights are off by, as far as no column tells it."""
-        ray, mixed = _product(mean_of, now), _product(density, now)[:, None]
+        ray, mixed = product(mean_of, now), product(density, now)[:, None]
         known, weight = about_mean(density / mixed), about_mean(wanted / mixed)
-        moments = _product(known.T, ray[:, None] * known)
-        told = _solve(moments, _product(known.T, ray[:, None] * weight))
-        return ray, weight - _product(known, told)
+        moments = product(known.T, ray[:, None] * known)
+        told = _solve(moments, product(known.T, ray[:, None] * weight))
+        return ray, weight - product(known, told)
 
     def better(_, state):
         now, best, least = state
         ray, off = rest(now)
         scatter = off**2
-        error = _product(ray, scatter)
+        error = product(ray, scatter)
         largest = jnp.max(error)
         best = jnp.where(largest < least, now, best)
         # the largest errors lead: the gradient of a high power mean, in damped steps
         lead = (error / largest) ** 8
-        borne = ray * _product(scatter, lead) / _product(density, now)
-        borne = _product(borne, density)
+        borne = ray * product(scatter, lead) / product(density, now)
+        borne = product(borne, density)
         new = now * (borne / jnp.sum(borne * now)) ** 0.2
         # never nothing: what the pilot missed would weigh without a bound
         new = jnp.maximum(new, 0.2 * shares)
@@ -479,7 +477,7 @@ def collect_bins(
             weight = _weights(weigher, each)
         into = _of(at, bins, weight.dtype).T
         w, w2 = carry
-        return (w + _product(into, weight), w2 + _product(into, weight**2)), None
+        return (w + product(into, weight), w2 + product(into, weight**2)), None
 
     zero = jnp.zeros((bins, weigher.asked.shape[1]), weigher.asked.dtype)
     chunks = _chunks(paths)
