@@ -20,7 +20,6 @@ from hylios_fit.surrogate import features
 from hylios_fit.threads import one_blas_thread
 
 FORM = "complex"
-# the embedded one that these compare: the other has a larger local regression as well
 CHOSEN = training.SIZES["small"][0]
 LOCAL_STEPS = 10_000
 STEPS = 10_000
@@ -29,7 +28,7 @@ ADAM, HALVINGS = 4, 9
 SPECIMENS = 32_768
 FRESH = 64  # of each kind
 PERCEPTRONS = (
-    (64, 64), (128, 128), (128, 128, 128), (192, 128, 128), (256, 128, 128), (384, 192, 192),
+    (64, 64), (96, 64, 48), (128, 96, 64), (192, 128, 128), (256, 256, 192), (384, 256, 256),
 )  # fmt: skip
 COMPONENTS = (5, 10, 20, 40, 60, 80)
 BANDS = 3

@@ -54,7 +54,7 @@ FEATURES_NM = np.array(
 )
 """Wavelengths at which the features hold how deep the layers are, optically."""
 DETOUR = 1.64  # bounces inside melanosomes make light absorbed weakly that much longer
-ACTIVATIONS = "silu", "tanh"  # of hidden units, functions of `jax.nn`
+ACTIVATIONS = "silu", "squareplus", "tanh"  # of hidden units, functions of `jax.nn`
 FAINT = 3e-3  # optical depth that is as good as none
 SLACK = 1e-5  # of the box's width, for rounding
 BLOCK = 4096  # rows of a batch of more than four blocks: what they need stays in the cache

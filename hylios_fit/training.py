@@ -80,8 +80,12 @@ LEAST = {True: 0.025, False: 0.003}
 LOOKED_AT = 384  # specimens that say how much it does
 SPECIMENS = 131_072  # of each form, that the local regression answers for
 COMPONENTS = 80
-SIZES = {"large": ((256, 256, 192), 30_000), "small": ((192, 128, 128), 40_000)}
-"""Hidden units and steps: whole spectra leave time for the first, few bands need the second."""
+SIZES = {
+    "large": ((256, 256, 192), 30_000, "silu"),
+    "small": ((128, 96, 64), 60_000, "squareplus"),
+}
+"""Hidden units, steps and activation: whole spectra leave time for the first; few bands need the
+second, where an exponential for each unit would count."""
 BATCH = 1024
 SEEN, EMPHASIS = (380.0, 720.0), 3.0  # nm; errors count so much more where the eye sees them
 CORNERS = 0.25  # what a specimen from all over the box weighs: the hardest, and few fits are there
@@ -166,7 +170,7 @@ def _trained(
         "seed": seed,
         "size": size,
         "depth": len(SIZES[size][0]) + 1,
-        "activation": Perceptron().activation,
+        "activation": SIZES[size][2],
         "held_out": f"{checks} fresh specimens of each form, by adding-doubling",
         "held_out_rms": {},
         "held_out_most": {},
@@ -664,7 +668,10 @@ def _fits(
             local = learn_locally(table, form, seed, bar, finer=finer, step=kept)
             x, log, along = answers(local, names, asked, seed)
             kept = steps.step(f"{form}-network")
-            network = Perceptron(*SIZES[size], BATCH, seed=seed, bar=bar, step=kept)
+            hidden, count, bend = SIZES[size]
+            network = Perceptron(
+                hidden, count, BATCH, seed=seed, activation=bend, bar=bar, step=kept
+            )
             seen = emphasis(table["wavelength_nm"].values)
             return fit(x, log, network, along, importance(len(asked)), seen)
 

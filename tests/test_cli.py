@@ -289,7 +289,7 @@ def test_a_table_is_made_trained_from_and_checked(folder, monkeypatch, capsys):
     monkeypatch.setattr(table, "FORMS", ("complex",))
     monkeypatch.setattr(training, "solve", solve)
     for name, value in (
-        ("SIZES", {"large": ((8, 8), 90), "small": ((7, 6), 60)}),
+        ("SIZES", {"large": ((8, 8), 90, "silu"), "small": ((7, 6), 60, "squareplus")}),
         ("LOCAL_HIDDEN", (8, 8)), ("LOCAL_STEPS", 90),
         ("SPECIMENS", 512), ("COMPONENTS", 8), ("LOOKED_AT", 16),
     ):  # fmt: skip

@@ -321,9 +321,12 @@ def test_it_evaluates_what_the_file_says(size):
     with np.load(data_path(module.EMBEDDED[size]), allow_pickle=False) as file:
         arrays = {name: file[name].astype(float) for name in file.files if name != "about"}
         about = json.loads(file["about"].tobytes())
-    bend = {"silu": lambda x: x / (1.0 + np.exp(-x)), "tanh": np.tanh}[
-        about.get("activation", "tanh")
-    ]
+    bends = {
+        "silu": lambda x: x / (1.0 + np.exp(-x)),
+        "squareplus": lambda x: 0.5 * (x + np.sqrt(x**2 + 4.0)),
+        "tanh": np.tanh,
+    }
+    bend = bends[about.get("activation", "tanh")]
     member = load_surrogate(size=size).at("dispersed")
     rows = np.random.default_rng(0).uniform(member.lower, member.upper, (20, len(member.names)))
     get = {name.partition("/")[2]: a for name, a in arrays.items() if name.startswith("dispersed/")}
@@ -365,7 +368,9 @@ def test_other_files_are_errors(tmp_path):
     def other_units(_, about):
         about["activation"] = "relu"
 
-    with pytest.raises(HyliosError, match="activation is one of silu, tanh, got 'relu'"):
+    with pytest.raises(
+        HyliosError, match="activation is one of silu, squareplus, tanh, got 'relu'"
+    ):
         load_surrogate(rewritten(tmp_path, other_units))
 
     def one_number(arrays, _):
@@ -410,7 +415,7 @@ def quick(monkeypatch):
     """Small networks, few specimens, and the stand-in also where training checks itself."""
     monkeypatch.setattr(training, "solve", stand_in)
     for name, value in (
-        ("SIZES", {"large": ((32, 32), 1000), "small": ((24, 24), 500)}),
+        ("SIZES", {"large": ((32, 32), 1000, "silu"), "small": ((24, 24), 500, "squareplus")}),
         ("LOCAL_HIDDEN", (24, 24)), ("LOCAL_STEPS", 2000),
         ("SPECIMENS", 2048), ("COMPONENTS", 16), ("ORDER_STEPS", 300), ("WAYS", (1, 1)),
         ("LOOKED_AT", 16),
