@@ -153,7 +153,7 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("-o", dest="output", metavar="SURROGATE", required=True)
     train.add_argument(
         "--size", choices=SIZES, default="large",
-        help="small: larger errors, twice as fast in batches of few bands",
+        help="small: twice the error, nearly three times as fast in batches of few bands",
     )  # fmt: skip
 
     check = command("check", _check, "held-out errors of a surrogate and the range it knows")
