@@ -305,7 +305,7 @@ def test_a_table_is_made_trained_from_and_checked(folder, monkeypatch, capsys):
     assert "256 rows" in said
     assert "hidden units: 7, 6\n" in said
     assert "worst band" in said
-    for size, units in (("small", "192, 128, 128"), ("large", "256, 256, 192")):
+    for size, units in (("small", "128, 96, 64"), ("large", "256, 256, 192")):
         assert run("check", size) == 0
         assert f"hidden units: {units}\n" in capsys.readouterr().out
     assert {path.name for path in folder.iterdir()} >= {"t.zarr", "s.npz"}
