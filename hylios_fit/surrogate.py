@@ -482,7 +482,7 @@ def load_surrogate(path: str | Path | None = None, size: str = "large") -> Surro
     """An embedded surrogate, or the one in a file that `hylios-fit train` wrote.
 
     `size` chooses among the embedded, without a path: the large one, or the small one, which errs
-    more and in batches of few bands (`Surrogate.on`) is twice as fast.
+    more and in batches of few bands (`Surrogate.on`) is nearly three times as fast.
     """
     if path is not None:
         return _load(Path(path))
