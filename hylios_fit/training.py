@@ -108,8 +108,8 @@ def train(
 ) -> str:
     """Train on the table and write the surrogate; returns the report that `check` prints.
 
-    `size` is one of `SIZES`: the small one errs twice as much, and in batches of few bands is nearly
-    three times as fast.
+    `size` is one of `SIZES`: the small one errs twice as much, and is nearly three times as fast in
+    batches of few bands.
 
     What is done stays in a folder beside the output, `OUT.training`, until all is: interrupted, the
     same call goes on there.
