@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from hylios_fit import fresnel, melanosome, scattering
+from hylios_fit.precision import product
 from hylios_fit.skin import Layers
 
 OUTSIDE, BELOW = -1, 6
@@ -165,7 +166,7 @@ def _particle(
     a2, b2 = (outer_a / size) ** 2, (outer_b / size) ** 2
 
     def half_width(size_, axis_, along):
-        return size_ * jnp.sqrt(a2 + (b2 - a2) * jnp.dot(axis_, along) ** 2)
+        return size_ * jnp.sqrt(a2 + (b2 - a2) * product(axis_, along) ** 2)
 
     half = half_width(size, axis, jnp.array([0.0, 0.0, 1.0], dtype))
     thickness = m.thickness[jnp.clip(ray.layer, 0, 5)]

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hylios_fit import datasets, fresnel
+from hylios_fit.precision import product
 
 FORMS = ("complex", "dispersed", "compact")
 MELANIN_INDEX = 1.7
@@ -183,7 +184,7 @@ def entry_point(
 def _bounce(key: Array, direction: Array, inward: Array, turned: Array) -> Array:
     """Reflect inside and perturb by the cosine law, drawn again until it stays inside."""
     # `turned` guards the loop: under vmap it also runs for rays that are out, without an end
-    mirrored = direction - 2.0 * jnp.dot(direction, inward) * inward
+    mirrored = direction - 2.0 * product(direction, inward) * inward
     mirrored = mirrored / jnp.linalg.norm(mirrored)
     p, q = (jnp.stack(v) for v in fresnel.basis((mirrored[0], mirrored[1], mirrored[2])))
 
@@ -196,7 +197,7 @@ def _bounce(key: Array, direction: Array, inward: Array, turned: Array) -> Array
         return key, sin * (jnp.cos(phi) * p + jnp.sin(phi) * q) + cos * mirrored
 
     def outside(state):
-        return turned & (jnp.dot(state[1], inward) <= 0)
+        return turned & (product(state[1], inward) <= 0)
 
     return jax.lax.while_loop(outside, draw, draw((key, mirrored)))[1]
 
@@ -205,7 +206,7 @@ def chord(position: Array, direction: Array, a: Array, b: Array) -> Array:
     """Length of the chord from a point on the spheroid (axes a, a, b) along a direction."""
     inverse = jnp.stack([1.0 / a, 1.0 / a, 1.0 / b])
     p, d = position * inverse, direction * inverse
-    return -2.0 * jnp.dot(p, d) / jnp.dot(d, d)
+    return -2.0 * product(p, d) / product(d, d)
 
 
 def trace_inside(
@@ -237,7 +238,7 @@ def trace_inside(
         position = position + length * direction
         inward = -position / jnp.stack([a, a, b]) ** 2
         inward = inward / jnp.linalg.norm(inward)
-        cos_i = jnp.clip(-jnp.dot(direction, inward), 0.0, 1.0)
+        cos_i = jnp.clip(-product(direction, inward), 0.0, 1.0)
         share = fresnel.reflectance(cos_i, index_ratio, jnp.ones_like(index_ratio))
         turned = inside & (jax.random.uniform(k_fresnel, dtype=dtype) < share)
         direction = jnp.where(turned, _bounce(k_bounce, direction, inward, turned), direction)

@@ -16,7 +16,7 @@ HIGHEST = "highest"
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 product = partial(jnp.matmul, precision=HIGHEST)
-"""A product of two matrices."""
+"""A product of two matrices, or of two vectors."""
 
 
 def in_full(function: Function) -> Function:

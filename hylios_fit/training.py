@@ -557,7 +557,7 @@ def learn_locally(
         inputs, logs, *changes = (np.concatenate(part) for part in zip(*lots, strict=True))
         along = changes[0] / scale, changes[1] / unit
         x, y = np.concatenate([x, (inputs - centre) / scale]), np.concatenate([y, logs])
-        weight = np.concatenate([weight, np.resize(seen, len(y) - len(weight))])
+        weight = np.concatenate([weight, np.resize(seen, len(y) - len(weight))])  # by wavelength
     y = (y - middle) / unit
     network = Perceptron(
         LOCAL_HIDDEN, steps or LOCAL_STEPS, LOCAL_BATCH, variance=variance, seed=seed, bar=bar,

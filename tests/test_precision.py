@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hylios_fit import adding, inversion, load_surrogate, sampling, tally, walker
+from hylios_fit import adding, analog, inversion, load_surrogate, sampling, skin, tally, walker
 from hylios_fit.precision import in_full, product
 from hylios_fit.skin import Specimen
 from hylios_fit.statevector import state_vector
@@ -52,6 +52,17 @@ def test_adding(way):
     ways = {"value": lambda f: f, "forward": jax.jacfwd, "reverse": jax.grad}
     mu_a = jnp.asarray(layers.mu_a, jnp.float32)
     assert in_full_only(ways[way](mean), mu_a)
+
+
+@pytest.mark.parametrize("form", ["complex", "dispersed"])
+def test_the_walk_to_the_letter(form, monkeypatch):
+    specimen = Specimen.preset("S3")
+    layers, melanin = specimen.layers(NM), skin.melanin_coefficient(specimen.values, NM)
+    fates, given = analog._fates, []
+    monkeypatch.setattr(analog, "_fates", lambda *args: given.append(args) or (0, 0))
+    analog.trace(layers, jnp.asarray(melanin, jnp.float32), form, 0, jax.random.key(0), 4)
+    key, one, form, incidence, rays, independent = given[0]
+    assert in_full_only(lambda key: fates(key, one, form, incidence, rays, independent), key)
 
 
 def test_sums_of_paths():
