@@ -17,8 +17,10 @@ from hylios_fit.threads import side_by_side
 from hylios_fit.units import WAVELENGTH_MAX, WAVELENGTH_MIN
 
 METHODS = ("walker", "analog", "adding", "surrogate")
-FIRST = 2  # batches (of `walker.BATCH`) before a tolerance is asked for
-GRAIN = 1024  # rays that a tolerance asks for come in multiples of this
+FIRST = 2 * walker.BATCH  # rays before a tolerance is asked for, where no pilot says how many
+FORESEEN = 1.08  # of the rays that a pilot says: it is a little too hopeful
+LOT = 262_144  # rays of one call, at most; every lot keeps lanes waiting for its last rays
+GRAIN = 1024  # rays come in multiples of this
 MOST_RAYS = 20_000_000  # where a tolerance stops asking for more
 ANALOG_BATCH = 4096
 ABSORB = 0.5  # see `walker.walk`: the answer does not depend on it, the cost does
@@ -136,51 +138,56 @@ def _walked(
     specimen, medium, nm, surface, rays, key, angle, tolerance, independent, progress
 ) -> Curve:
     plan, own_only = walker.plan_or_own(medium, ABSORB)
-    batch = walker.batch_rays()
-    if tolerance is None:
-        batch = min(batch, rays)
+    few = tolerance is None and rays < walker.BATCH
+    most = rays if few else walker.batch_rays() if own_only else max(walker.batch_rays(), LOT)
     walk = partial(
-        walker.walk, form=specimen.melanosome_form, incidence=angle, rays=batch,
+        walker.walk, form=specimen.melanosome_form, incidence=angle, rays=most,
         independent=independent,
     )  # fmt: skip
-    if batch >= walker.BATCH and not own_only:
-        other = jax.random.fold_in(key, 1)
-        pilot = walk(plan.layers, key=other, shares=plan.shares, sent=tally.PILOT)
-        plan = tally.improve(pilot, plan, medium)
+    more = rays if tolerance is None else FIRST
+    if not few and not own_only:
+        other, shares = jax.random.fold_in(key, 1), plan.shares
+        pilot = walk(
+            plan.layers, key=other, shares=shares, sent=tally.PILOT, leave=tally.PILOT_LEAVES
+        )
+        plan, spread = tally.improve(pilot, plan, medium)
+        if tolerance is not None:
+            more = FORESEEN * float(np.max(1.0 - surface)) ** 2 * spread / tolerance**2
+            # fewer say little of their own error, and steady each other not at all
+            least = tally.ENOUGH * tally.FOLDS / (tally.FOLDS - 1)
+            more = math.ceil(max(more, least) / GRAIN) * GRAIN
 
-    def lot(part: tuple[int, int]) -> tally.Tally:
+    def lot(part: tuple[int, int]) -> tally.Sums:
         first, many = part
         paths = walk(plan.layers, key=key, first=first, shares=plan.shares, sent=many)
-        return tally.collect(
+        return tally.gather(
             paths, plan.layers, medium, own_only=own_only, shares=plan.shares, sent=many
         )
 
-    total, sent = None, 0
-    more = math.ceil(rays / batch) * batch if tolerance is None else FIRST * walker.BATCH
+    sums, sent = None, 0
     with progress_bar(rays if tolerance is None else None, progress) as bar:
         while more:
-            each = batch
             if tolerance is not None:
                 more = min(more, MOST_RAYS - sent)
-                # an even number, so that two cores end together; not that of this machine's cores,
-                # or the same key would give other paths elsewhere
-                many = 2 * math.ceil(more / batch / 2)
-                each = math.ceil(more / many / GRAIN) * GRAIN
+            # an even number, so that two cores end together; not that of this machine's cores, or
+            # the same key would give other paths elsewhere
+            many = 1 if few else 2 * math.ceil(more / most / 2)
+            each = more if few else math.ceil(more / many / GRAIN) * GRAIN
             lots = [(i, min(each, sent + more - i)) for i in range(sent, sent + more, each)]
             for (_, some), found in zip(lots, side_by_side(lot, lots), strict=True):
-                total = tally.add(total, found)
+                sums = tally.add(sums, found)
                 bar.update(some)
             sent += more
-            assert total is not None
+            assert sums is not None
+            total = tally.tell(sums)
             error = (1.0 - surface) * np.asarray(total.standard_error, float)
             more = 0
             if tolerance is not None and np.max(error) > tolerance and sent < MOST_RAYS:
                 # less where much is missing, and at last a little more: the error is an estimate,
                 # and the last rays of every lot leave lanes idle
                 missing = ((np.max(error) / tolerance) ** 2 - 1.0) * sent
-                share = 0.9 if missing > 8 * batch else 1.05
+                share = 0.9 if missing > 2 * most else 1.05
                 more = math.ceil(share * missing / GRAIN) * GRAIN
-    assert total is not None
     inside = (1.0 - surface) * np.asarray(total.mean, float)
     return Curve(
         nm, surface + inside, error, surface, inside, "walker", sent,

@@ -7,7 +7,7 @@ the mean of its densities under the layers that were walked.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,7 @@ from hylios_fit.walker import (
 CHUNK, ACCELERATOR_CHUNK = 64, 8192  # rays at a time: memory does not depend on their number
 GROUP = 64  # rays whose sum counts as one for the errors: columns take turns within it
 GROUPS = 256  # no fewer, or what they say of the errors is noise
-PILOT = 2048  # rays that `improve` looks at
+PILOT, PILOT_LEAVES = 4096, 40  # rays that `improve` looks at; how many may be on their way yet
 WATCHED = 128  # wavelengths whose errors shares are chosen by
 TINY = 1e-9  # and at least this, where no ray knows a column
 FOLDS = 8  # of the rays of a sum: what each takes off the others say
@@ -70,6 +70,9 @@ class Tally(NamedTuple):
     def effective_rays(self) -> Float[Array, "w"]:
         """Effective number of the rays that came back: (sum w)^2 / sum w^2."""
         return self.weight**2 / jnp.maximum(self.weight2, 1e-30)
+
+
+Lots = TypeVar("Lots", Tally, "Sums")
 
 
 class _Weigher(NamedTuple):
@@ -197,40 +200,41 @@ def _group(rays: int) -> int:
     return min(GROUP, 1 << max((rays // GROUPS).bit_length() - 1, 0))
 
 
-class _Sums(NamedTuple):
-    """Sums over the rays of each fold (f) and its groups: the rays, the weights (w) and their
-    squares; what each column (k) has of the paths' densities beyond its share; and products of the
-    sums of a group, over its rays. At last, where slopes are asked for and over all folds, of sums
-    along paths times what their weights count."""
+class Sums(NamedTuple):
+    """Sums over the rays of each fold (f) and its groups: the rays and groups, the weights (w) and
+    their squares; what each column (k) has of the paths' densities beyond its share; and products
+    of the sums of a group, over its rays. `add` those of lots that share a plan."""
 
     rays: Float[Array, "f"]
+    groups: Float[Array, "f"]
     weight: Float[Array, "f w"]
     weight2: Float[Array, "f w"]
     squares: Float[Array, "f w"]
     beyond: Float[Array, "f k"]
     beyond2: Float[Array, "f k k"]
     cross: Float[Array, "f k w"]
-    by_sum: Float[Array, "18 w"] | None
 
 
 @jax.custom_jvp
-def _sum_weights(weigher: _Weigher, paths: Paths, sent: Array) -> tuple[Array, Array, Array]:
-    """(w,) sums of the weights, of their squares, and of the squares of groups over their rays."""
-    return _steadied(_sums(weigher, paths, sent))
+def _shared(weigher: _Weigher, paths: Paths, sent: Array) -> Tally:
+    return tell(_sums(weigher, paths, sent)[0])
 
 
-@_sum_weights.defjvp
+@_shared.defjvp
 def _(primals, tangents):
     # The derivative of a weight is the weight times the sums along its path: their means serve
     # every parameter at once.
-    sums = _sums(*primals, slopes=True)
-    slope = jnp.sum(sums.by_sum * tangents[0].asked, axis=0)
-    weight, weight2, squares = _steadied(sums)
-    none = jnp.zeros_like(weight2)
-    return (weight, weight2, squares), (slope.astype(weight.dtype), none, none)
+    sums, by_sum = _sums(*primals, slopes=True)
+    found = tell(sums)
+    slope = jnp.sum(by_sum * tangents[0].asked, axis=0).astype(found.weight.dtype)
+    return found, jax.tree.map(jnp.zeros_like, found)._replace(weight=slope)
 
 
-def _sums(weigher: _Weigher, paths: Paths, sent: Array, slopes: bool = False) -> _Sums:
+def _sums(
+    weigher: _Weigher, paths: Paths, sent: Array, slopes: bool = False
+) -> tuple[Sums, Array | None]:
+    """The sums; and (18, w), where slopes are asked for, those along paths times what their weights
+    count."""
     width, dtype = weigher.asked.shape[1], weigher.asked.dtype
     group = _group(paths.hero.shape[0])
     chunks = _chunks(paths, group)
@@ -279,12 +283,12 @@ def _sums(weigher: _Weigher, paths: Paths, sent: Array, slopes: bool = False) ->
         factor = _factors(*found)
 
     def part(f, i, carry):
+        carry, by_sum = carry
         chunk, log, count, c = look(i)
         weight = _wanted(weigher, chunk, log)
         w = grouped(weight)
         inverse = 1.0 / jnp.maximum(count, 1.0)[:, None]
         scaled = c * inverse
-        by_sum = carry.by_sum
         if by_sum is not None:
             counts = weight
             if factor is not None:
@@ -292,23 +296,24 @@ def _sums(weigher: _Weigher, paths: Paths, sent: Array, slopes: bool = False) ->
                 counts = weight * jnp.repeat(level[f] - product(scaled, tilt[f]), group)[:, None]
             by_sum = by_sum + product(chunk.sums.T, counts)
         rays, beyond, beyond2 = known_so_far((carry.rays, carry.beyond, carry.beyond2), count, c)
-        return _Sums(
+        found = Sums(
             rays,
+            carry.groups + jnp.sum((count > 0).astype(dtype)),
             carry.weight + jnp.sum(w, axis=0),
             carry.weight2 + jnp.sum(weight**2, axis=0),
             carry.squares + jnp.sum(w**2 * inverse, axis=0),
             beyond,
             beyond2,
             carry.cross + product(scaled.T, w),
-            by_sum,
         )
+        return found, by_sum
 
-    zero = _Sums(
-        zeros(), zeros(width), zeros(width), zeros(width), zeros(known), zeros(known, known),
-        zeros(known, width), zeros(SUMS, width) if slopes else None,
+    zero = Sums(
+        zeros(), zeros(), zeros(width), zeros(width), zeros(width), zeros(known),
+        zeros(known, known), zeros(known, width),
     )  # fmt: skip
-    found = over(part, zero)
-    return found if found.by_sum is None else found._replace(by_sum=jnp.sum(found.by_sum, axis=0))
+    found, by_sum = over(part, (zero, zeros(SUMS, width) if slopes else None))
+    return found, None if by_sum is None else jnp.sum(by_sum, axis=0)
 
 
 def _others(x: Array) -> Array:
@@ -330,26 +335,28 @@ def _inverses(rays: Array, beyond2: Array) -> Array:
     return jnp.where((_others(rays) >= ENOUGH)[:, None, None], inverse, 0.0)
 
 
-def _steadied(sums: _Sums) -> tuple[Array, Array, Array]:
-    """(w,) sums of the weights, of their squares, and of those of groups, after what the columns
-    tell is taken off the first and the last: of each fold as much as goes with it in the others.
-    """
-    weight, squares = (jnp.sum(x, axis=0) for x in (sums.weight, sums.squares))
-    weight2 = jnp.sum(sums.weight2, axis=0)
-    if not sums.beyond.shape[1]:
-        return weight, weight2, squares
-    rays, beyond, light, cross = (
-        _others(x) for x in (sums.rays, sums.beyond, sums.weight, sums.cross)
+@jax.jit
+def tell(sums: Sums) -> Tally:
+    """The sums of all folds, after what the columns tell is taken off the weights and the squares
+    of groups: of each fold as much as goes with it in the others."""
+    rays, groups = jnp.sum(sums.rays), jnp.sum(sums.groups)
+    weight, weight2, squares = (
+        jnp.sum(x, axis=0) for x in (sums.weight, sums.weight2, sums.squares)
     )
-    cross = cross - beyond[..., None] * (light / jnp.maximum(rays, 1.0)[:, None])[:, None]
-    controls = product(_inverses(sums.rays, sums.beyond2), cross)
-    weight = weight - jnp.einsum("fk,fkw->w", sums.beyond, controls, precision=HIGHEST)
-    twice = product(sums.beyond2, controls) - 2.0 * sums.cross
-    return weight, weight2, squares + jnp.sum(twice * controls, axis=(0, 1))
+    if sums.beyond.shape[1]:
+        others, beyond, light, cross = (
+            _others(x) for x in (sums.rays, sums.beyond, sums.weight, sums.cross)
+        )
+        cross = cross - beyond[..., None] * (light / jnp.maximum(others, 1.0)[:, None])[:, None]
+        controls = product(_inverses(sums.rays, sums.beyond2), cross)
+        weight = weight - jnp.einsum("fk,fkw->w", sums.beyond, controls, precision=HIGHEST)
+        twice = product(sums.beyond2, controls) - 2.0 * sums.cross
+        squares = squares + jnp.sum(twice * controls, axis=(0, 1))
+    return Tally(rays, groups, weight, weight2, squares)
 
 
 def _factors(rays: Array, beyond: Array, beyond2: Array) -> tuple[Array, Array]:
-    """What the weights of a group count in `_steadied`'s sum, which is linear in them: so much by
+    """What the weights of a group count in what `tell` sums up, which is linear in them: so much by
     fold (f,), less (f, k) times what the columns have beyond their shares, by ray."""
     tilt = jnp.einsum("fkl,fl->fk", _inverses(rays, beyond2), beyond, precision=HIGHEST)
     level = jnp.sum(tilt * _others(beyond), axis=1) / jnp.maximum(_others(rays), 1.0)
@@ -381,26 +388,55 @@ def collect(
     every eighth of the rays (`FOLDS`) is told by the others, so that it biases nothing; where
     hardly any light comes back the mean may fall below 0, within its error.
     """
-    rays, columns = paths.hero.shape[0], walked.mu_a.shape[1]
+    weigher, sent = _to_sum(paths, walked, asked, absorb, own_only, shares, sent)
+    if own_only:
+        return tell(_own_sums(weigher, paths, sent))
+    return _shared(weigher, paths, sent)
+
+
+@partial(jax.jit, static_argnames=("own_only",))
+def gather(
+    paths: Paths,
+    walked: Layers,
+    asked: Layers,
+    absorb: float = 1.0,
+    own_only: bool = False,
+    shares: Float[Array, "k"] | None = None,
+    sent: Any = None,
+) -> Sums:
+    """As `collect`, of one lot of several: `tell` what all of them `add` up to, so that a small lot
+    is steadied by what the others know. Not differentiable."""
+    weigher, sent = _to_sum(paths, walked, asked, absorb, own_only, shares, sent)
+    return _own_sums(weigher, paths, sent) if own_only else _sums(weigher, paths, sent)[0]
+
+
+def _to_sum(paths, walked, asked, absorb, own_only, shares, sent) -> tuple[_Weigher, Array]:
+    rays = paths.hero.shape[0]
     many = shares is not None and not own_only and rays - rays // FOLDS >= ENOUGH
     weigher = _weigher(walked, asked, absorb, shares, own_only, ended=many)
-    sent = jnp.asarray(rays if sent is None else sent, jnp.int32)
+    return weigher, jnp.asarray(rays if sent is None else sent, jnp.int32)
+
+
+def _own_sums(weigher: _Weigher, paths: Paths, sent: Array) -> Sums:
+    """Each column has its share of the rays: only the scatter about its own mean is error."""
+    rays, columns = paths.hero.shape[0], weigher.walked.shape[1]
     total = sent.astype(weigher.asked.dtype)
-    if not own_only:
-        groups = jnp.ceil(total / _group(rays))
-        return Tally(total, groups, *_sum_weights(weigher, paths, sent))
-    # each column has its share of the rays: only the scatter about its own mean is error
     out = (jnp.arange(rays, dtype=jnp.int32) < sent).astype(total.dtype)
     count = jnp.bincount(paths.hero, out, length=columns)
     weight, weight2 = _sum_own_weights(weigher, paths, columns)
     still = jax.lax.stop_gradient(weight) ** 2
     squares = weight2 + still / total - still / jnp.maximum(count, 1.0)
-    means = jnp.sum((count > 0).astype(total.dtype))
-    return Tally(total, total - means + 1.0, weight, weight2, squares)
+    groups = total - jnp.sum((count > 0).astype(total.dtype)) + 1.0
+    none = jnp.zeros((1, 0), total.dtype)
+    return Sums(
+        total[None], groups[None], weight[None], weight2[None], squares[None],
+        none, none[..., None], none[..., None],
+    )  # fmt: skip
 
 
-def improve(paths: Paths, plan: Plan, asked: Layers, rays: int = PILOT) -> Plan:
-    """The plan with shares that make the largest error among the wavelengths smaller.
+def improve(paths: Paths, plan: Plan, asked: Layers, rays: int = PILOT) -> tuple[Plan, float]:
+    """The plan with shares that make the largest error among the wavelengths smaller, and what that
+    will be: its square, times the rays.
 
     From a pilot, the `paths` of that plan, of which it looks at the first `rays`.
     """
@@ -411,12 +447,12 @@ def improve(paths: Paths, plan: Plan, asked: Layers, rays: int = PILOT) -> Plan:
         if name not in ("thickness", "bottom", "roughness")
     }
     pilot = Paths(*(part[:rays] for part in paths))
-    shares = _improve(pilot, plan.layers, asked._replace(**every), plan.shares)
-    return plan._replace(shares=shares)
+    shares, variance = _improve(pilot, plan.layers, asked._replace(**every), plan.shares)
+    return plan._replace(shares=shares), float(variance)
 
 
 @jax.jit
-def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> Array:
+def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> tuple[Array, Array]:
     weigher = _weigher(walked, asked, 1.0, shares, ended=True)
     each = _walked(weigher, paths)
     largest = jnp.max(each, axis=1)
@@ -443,17 +479,18 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> Arra
         error = product(ray, scatter)
         largest = jnp.max(error)
         best = jnp.where(largest < least, now, best)
-        # the largest errors lead: the gradient of a high power mean, in damped steps
-        lead = (error / largest) ** 8
+        # the largest errors lead: the gradient of a high power mean, in steps damped enough that
+        # they do not swing
+        lead = (error / largest) ** 16
         borne = ray * product(scatter, lead) / product(density, now)
         borne = product(borne, density)
-        new = now * (borne / jnp.sum(borne * now)) ** 0.2
+        new = now * (borne / jnp.sum(borne * now)) ** 0.1
         # never nothing: what the pilot missed would weigh without a bound
         new = jnp.maximum(new, 0.2 * shares)
         return new / jnp.sum(new), best, jnp.minimum(least, largest)
 
     start = (shares, shares, jnp.asarray(jnp.inf, density.dtype))
-    return jax.lax.fori_loop(0, 40, better, start)[1]
+    return jax.lax.fori_loop(0, 12, better, start)[1:]
 
 
 @partial(jax.jit, static_argnames=("bins", "own_only"))
@@ -491,9 +528,9 @@ def out_below(paths: Paths) -> Paths:
     return paths._replace(escaped=-paths.escaped)
 
 
-def add(one: Tally | None, two: Tally) -> Tally:
+def add(one: Lots | None, two: Lots) -> Lots:
     """The sums of two lots of rays."""
-    return two if one is None else Tally(*(a + b for a, b in zip(one, two, strict=True)))
+    return two if one is None else jax.tree.map(jnp.add, one, two)
 
 
 def moments(

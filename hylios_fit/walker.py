@@ -51,7 +51,10 @@ NODES = scattering.LATIMER_ANGLE * np.sqrt(
 FAR = 0.006  # nodes that would weigh no more, from 2.3 gaps away, count nothing
 EASE = 0.002  # added to squares of angles, over the largest, in whose logarithm reflectance is even
 DRAWS = 11  # random numbers that a step may take
-ROUND = 16  # steps between two exchanges of rays that ended
+MANY = 10  # particles in a pass through the strata
+# of `_particle_step` before each `_step`, and of that between two exchanges of rays that ended; and
+# both where a pass meets `MANY`
+STEPS, STEPS_AMONG_MANY = (0, 16), (3, 10)
 LANES, ACCELERATOR_LANES = 1024, 1 << 17
 BATCH, ACCELERATOR_BATCH = 65_536, 1 << 19  # rays of one compiled call (`batch_rays`)
 
@@ -286,6 +289,171 @@ def _there(m: _Medium, new: tuple, old: tuple, depth: Array, thickness: Array) -
     return fits & ((old[3] == 0) | (gap2 >= reach2))
 
 
+class _Near(NamedTuple):
+    """Of the layer that each ray is in."""
+
+    absorb: Array
+    event: Array
+    albedo: Array
+    thickness: Array
+    size: Array  # of its particles
+
+
+def _near(m: _Medium, layer: Array, hero: Array) -> _Near:
+    row = jnp.maximum(layer, 0) * (m.event.shape[0] // 7) + hero
+    return _Near(
+        _at(m.absorb, row),
+        _at(m.event, row),
+        _at(m.albedo, row),
+        _thickness(m, layer, hero),
+        _pick(m.particle, layer - 1),
+    )
+
+
+def _fly(
+    lane: _Lane, m: _Medium, near: _Near, moves: Array, u1: Array, u2: Array
+) -> tuple[Array, Array, Array, Array, Array]:
+    """The way to the next event or interface: which rays cross, are absorbed, meet something; how
+    far they go, and how deep they then are."""
+    dtype = lane.depth.dtype
+    rate = near.event + near.absorb
+    ahead = jnp.where(lane.u[2] > 0, near.thickness - lane.depth, lane.depth)
+    ahead = ahead / jnp.maximum(jnp.abs(lane.u[2]), 1e-12)
+    reach = -jnp.log(u1) / jnp.maximum(rate, 1e-30)
+    crosses = moves & (reach >= ahead)
+    stops = moves & ~crosses
+    met = stops & (u2 * rate >= near.absorb) & (near.event > 0)
+    absorbed, met, distance = _keep(
+        m,
+        _number(stops & ~met, dtype),
+        _number(met, dtype),
+        jnp.where(moves, jnp.minimum(reach, ahead), 0.0),
+    )
+    (depth,) = _keep(m, jnp.clip(lane.depth + distance * lane.u[2], 0.0, near.thickness))
+    return crosses, absorbed > 0, met > 0, distance, depth
+
+
+def _meet(
+    lane: _Lane,
+    m: _Medium,
+    near: _Near,
+    met: Array,
+    distance: Array,
+    depth: Array,
+    p: tuple,
+    q: tuple,
+    xi: tuple,
+    spheroid: bool,
+) -> tuple[Any, Array]:
+    """The particle that rays met, or the one before; and whether it can be where they met it."""
+    before = lane.before
+    if not before:
+        return before, met
+    moved = [b - distance * ui for b, ui in zip(before[:3], lane.u, strict=True)]
+    before = (*_keep(m, *moved), *before[3:])
+    new = (_spheroid if spheroid else _sphere)(m, near.size, lane.u, p, q, xi)
+    can = met & _there(m, new, before, depth, near.thickness)
+    hit = _keep(m, _number(can, depth.dtype))[0] > 0
+    return tuple(jnp.where(hit, n, o) for n, o in zip(new, before, strict=True)), hit
+
+
+def _bend(
+    m: _Medium, theta_0: Array, u7: Array, u8: Array, u10: Array
+) -> tuple[Array, Array, Array, Array]:
+    """A polar angle for a hit, its cosine and sine, and whether it stands (Algorithm 1)."""
+    theta = scattering.exponential_proposal(theta_0, u7, u8)
+    cos, sin = _keep(m, *_cos_sin(jnp.minimum(0.5 * theta, 0.5 * math.pi)))
+    return theta, cos, sin, scattering.exponential_accepts(theta, sin, u10)
+
+
+def _turned(
+    m: _Medium, u: tuple, p: tuple, q: tuple, cos: Array, sin: Array, xi: Array
+) -> tuple[Array, Array, Array]:
+    """The direction, turned by an angle about a uniform azimuth."""
+    c, s = _keep(m, *_circle(xi))
+    cos, b, c = _keep(m, cos, sin * c, sin * s)
+    return fresnel.unit(_keep(m, *_combine(cos, u, b, p, c, q)))
+
+
+def _particle_step(
+    state: tuple[_Lane, Array, Array, Array],
+    m: _Medium,
+    near: _Near,
+    theta_0: Array,
+    step: Array,
+    spheroid: bool,
+) -> tuple[_Lane, Array, Array, Array]:
+    """As `_step`, of rays among melanosomes, up to an interface; all others wait. With the lane:
+    the length, the hits and the particles proposed since its layer was looked up (`near`)."""
+    lane, length, hits, proposed = state
+    dtype = lane.depth.dtype
+    u1, u2, u3, u4, u5, u6, u7, u8, u9, u10, u11 = _keep(
+        m, *(_uniform(lane.seeds, step, draw, dtype) for draw in range(DRAWS))
+    )
+    layer = lane.layer
+    moves = (lane.phase == FLYING) & (layer >= 1) & (layer <= 3)
+    crosses, absorbed, met, distance, depth = _fly(lane, m, near, moves, u1, u2)
+    p, q = fresnel.basis((lane.u[0], lane.u[1], lane.u[2]))
+    p, q = _keep(m, *p), _keep(m, *q)
+    before, hit = _meet(lane, m, near, met, distance, depth, p, q, (u5, u9, u4, u11), spheroid)
+    ends = absorbed | (hit & (u3 >= near.albedo))
+
+    theta, cos, sin, accepted = _bend(m, theta_0, u7, u8, u10)
+    bends = hit | (lane.phase == AGAIN)
+    turns = bends & accepted
+    cos, sin = jnp.where(turns, cos, 1.0), jnp.where(turns, sin, 0.0)
+    u = _turned(m, lane.u, p, q, cos, sin, u6)
+
+    end = jnp.where(absorbed, ABSORBED, BY_HIT - 1) + layer
+    phase = jnp.where(bends & ~accepted, AGAIN, jnp.where(turns, FLYING, lane.phase))
+    phase = jnp.where(crosses, WAITING, phase)
+    phase = jnp.where(ends, ENDED + end, phase)
+    lane = lane._replace(
+        depth=depth,
+        u=u,
+        phase=phase,
+        before=before,
+        place=tuple(x + distance * ui for x, ui in zip(lane.place, lane.u, strict=False)),
+        bent=lane.bent + jnp.where(turns & ~ends, theta, 0.0),
+    )
+    return (
+        lane,
+        length + distance,
+        hits + _number(hit & ~ends, dtype),
+        proposed + _number(met, dtype),
+    )
+
+
+def _among(
+    lane: _Lane,
+    m: _Medium,
+    hero: Array,
+    theta_0: Array,
+    first: Array,
+    steps: int,
+    spheroid: bool,
+) -> _Lane:
+    """So many of `_particle_step`, during which no ray changes its layer."""
+    near = _near(m, lane.layer, hero)
+    zero = jnp.zeros_like(lane.depth)
+
+    def one(i, state):
+        return _particle_step(state, m, near, theta_0, first + i.astype(jnp.uint32), spheroid)
+
+    state: Any = jax.lax.fori_loop(0, steps, one, (lane, zero, zero, zero))
+    lane, length, hits, proposed = state
+
+    def there(i: int, new: Array) -> Array:
+        return jnp.where(lane.layer == i, new, 0.0)
+
+    seen = [there(i, new) for new in (hits, proposed) for i in (1, 2, 3)]
+    counts = [old + new for old, new in zip(lane.counts[:6], seen, strict=True)]
+    return lane._replace(
+        lengths=tuple(old + there(i, length) for i, old in enumerate(lane.lengths)),
+        counts=(*counts, *lane.counts[6:]),
+    )
+
+
 def _step(
     lane: _Lane,
     m: _Medium,
@@ -302,59 +470,26 @@ def _step(
         m, *(_uniform(lane.seeds, step, draw, dtype) for draw in range(DRAWS))
     )
 
-    # the way to the next event
     layer = lane.layer
-    row = jnp.maximum(layer, 0) * columns + hero
-    absorb = _at(m.absorb, row)
-    event = _at(m.event, row)
-    rate = event + absorb
-    thickness = _thickness(m, layer, hero)
-    ahead = jnp.where(lane.u[2] > 0, thickness - lane.depth, lane.depth)
-    ahead = ahead / jnp.maximum(jnp.abs(lane.u[2]), 1e-12)
-    reach = -jnp.log(u1) / jnp.maximum(rate, 1e-30)
+    near = _near(m, layer, hero)
     moves = lane.phase == FLYING
-    crosses = moves & (reach >= ahead)
-    stops = moves & ~crosses
-    met = stops & (u2 * rate >= absorb) & (event > 0)
-    absorbed, met, distance = _keep(
-        m,
-        _number(stops & ~met, dtype),
-        _number(met, dtype),
-        jnp.where(moves, jnp.minimum(reach, ahead), 0.0),
-    )
-    (depth,) = _keep(m, jnp.clip(lane.depth + distance * lane.u[2], 0.0, thickness))
-    absorbed, met = absorbed > 0, met > 0
+    crosses, absorbed, met, distance, depth = _fly(lane, m, near, moves, u1, u2)
     fibre, tissue = met & (layer == 4), met & (layer == 5)
     met = met & (layer <= 3)
-
-    # the particle: where it lies, whether it can be there
     p, q = fresnel.basis((lane.u[0], lane.u[1], lane.u[2]))
     p, q = _keep(m, *p), _keep(m, *q)
-    before, hit = lane.before, met
-    if before:
-        moved = [b - distance * ui for b, ui in zip(before[:3], lane.u, strict=True)]
-        before = (*_keep(m, *moved), *before[3:])
-        make = _spheroid if spheroid else _sphere
-        new = make(m, _pick(m.particle, layer - 1), lane.u, p, q, (u5, u9, u4, u11))
-        (there,) = _keep(m, _number(met & _there(m, new, before, depth, thickness), dtype))
-        hit = there > 0
-        before = tuple(jnp.where(hit, n, o) for n, o in zip(new, before, strict=True))
-    ends = absorbed | (hit & (u3 >= _at(m.albedo, row)))
+    before, hit = _meet(lane, m, near, met, distance, depth, p, q, (u5, u9, u4, u11), spheroid)
+    ends = absorbed | (hit & (u3 >= near.albedo))
 
     # the new direction
-    theta = scattering.exponential_proposal(theta_0, u7, u8)
-    cos, sin = _keep(m, *_cos_sin(jnp.minimum(0.5 * theta, 0.5 * math.pi)))
+    theta, cos, sin, accepted = _bend(m, theta_0, u7, u8, u10)
     bends = hit | (lane.phase == AGAIN)
-    accepted = scattering.exponential_accepts(theta, sin, u10)
     cos_f = jnp.where(tissue, 2.0 * u3 - 1.0, scattering.rayleigh_cosine(u7, u8, u3, u10))
     turns = (bends & accepted) | fibre | tissue
     cos = jnp.where(turns, jnp.where(bends, cos, cos_f), 1.0)
     sin_f = jnp.sqrt(jnp.clip(1.0 - cos_f**2, 0.0, 1.0))
     sin = jnp.where(turns, jnp.where(bends, sin, sin_f), 0.0)
-    c, s = _keep(m, *_circle(u6))
-    cos, b, c = _keep(m, cos, sin * c, sin * s)
-    u = _keep(m, *_combine(cos, lane.u, b, p, c, q))
-    u = fresnel.unit(u)
+    u = _turned(m, lane.u, p, q, cos, sin, u6)
 
     # the interface
     here = crosses | (lane.phase == WAITING)
@@ -466,9 +601,12 @@ def _sums(lane: _Lane) -> Array:
     return jnp.stack(rows, axis=1)
 
 
+_KINDS = ("independent", "spheroid", "exits", "below")
+
+
 @partial(
     jax.jit,
-    static_argnames=("rays", "independent", "spheroid", "exits", "below", "lanes", "round_length"),
+    static_argnames=(*_KINDS, "rays", "lanes", "among", "round_length"),
     compiler_options=COMPILED,
 )
 def _walk(
@@ -479,12 +617,14 @@ def _walk(
     first: Array,
     sent: Array,
     incidence: Array,
+    leave: Array,
     rays: int,
     independent: bool,
     spheroid: bool,
     exits: bool,
     below: int,
     lanes: int,
+    among: int,
     round_length: int,
 ) -> tuple[Paths, Array]:
     dtype = medium.thickness.dtype
@@ -502,6 +642,9 @@ def _walk(
         def one(_, carry):
             step, lane = carry
             step = step + 1
+            if among:
+                lane = _among(lane, medium, hero, theta_0, step, among, spheroid)
+                step = step + jnp.uint32(among)
             return step, _step(lane, medium, hero, theta_0, step, spheroid, below)
 
         step, lane = jax.lax.fori_loop(0, round_length, one, (step, lane))
@@ -536,7 +679,9 @@ def _walk(
         jnp.asarray(lanes, jnp.int32),
     )
     state = jax.lax.while_loop(
-        lambda s: jnp.any((s[1].phase < ABOVE) & (s[2] < sent)), round_, state
+        lambda s: jnp.sum((s[1].phase < ABOVE) & (s[2] < sent), dtype=jnp.int32) > leave,
+        round_,
+        state,
     )
     _, _, _, sums, escaped, end, left, _ = state
     return Paths(sums, escaped, heroes, end), left
@@ -555,6 +700,7 @@ def walk(
     heroes: np.ndarray | None = None,
     shares: Float[Array, "k"] | None = None,
     sent: int | None = None,
+    leave: int = 0,
 ) -> Paths:
     """Walk `rays` rays, number `first` and on, spread over the layers' columns.
 
@@ -563,11 +709,12 @@ def walk(
     overlap the one before or cross a boundary. `incidence` in radians. The same key and numbers
     (`first`, `rays`) give the same paths. `shares` of the rays for each column, by default
     `hero_shares`; or `heroes`, the column of each. Only the first `sent` of them set out, if given:
-    a pilot needs no program of its own.
+    a pilot needs no program of its own. It may `leave` so many on their way: they count as lost,
+    which no answer can take.
     """
     return _run(
         layers, form, key, incidence, first, rays, absorb, independent, heroes, shares, False,
-        LAYERS[-1], sent,
+        LAYERS[-1], sent, leave,
     )[0]  # fmt: skip
 
 
@@ -598,14 +745,15 @@ def walk_out(
 
 def _run(
     layers, form, key, incidence, first, rays, absorb, independent, heroes, shares, exits, last,
-    sent=None,
+    sent=None, leave=0,
 ) -> tuple[Paths, Array]:  # fmt: skip
     medium = _medium(layers, form, absorb)
     bits = jax.random.bits(key, (2,), jnp.uint32)
+    sent = rays if sent is None else sent
     if heroes is None:
         shares = hero_shares(layers.theta_0) if shares is None else shares
-        heroes = spread(shares, bits, first, rays)
-    sent = rays if sent is None else sent
+        heroes = np.zeros(rays, np.int32)
+        heroes[:sent] = spread(shares, bits, first, sent)
     return _walk(
         medium,
         jnp.asarray(heroes, jnp.int32),
@@ -614,19 +762,29 @@ def _run(
         jnp.asarray(first, jnp.uint32),
         jnp.asarray(sent, jnp.int32),
         jnp.asarray(incidence, layers.mu_a.dtype),
+        jnp.asarray(leave, jnp.int32),
         rays,
         independent,
         form == "dispersed",
         exits,
         LAYERS.index(last),
         min(LANES if jax.default_backend() == "cpu" else ACCELERATOR_LANES, rays),
-        ROUND,
+        *_rhythm(medium),
     )
 
 
 def batch_rays() -> int:
     """Rays of one compiled call: memory does not depend on how many there are in all."""
     return BATCH if jax.default_backend() == "cpu" else ACCELERATOR_BATCH
+
+
+def _rhythm(medium: _Medium) -> tuple[int, int]:
+    """`STEPS`, or `STEPS_AMONG_MANY`: there a ray seldom needs a step that knows all else."""
+    event, thickness = (
+        np.asarray(part).reshape(7, -1)[1:4] for part in (medium.event, medium.thickness)
+    )
+    many = np.mean(np.sum(event * thickness, axis=0)) > MANY
+    return STEPS_AMONG_MANY if many else STEPS
 
 
 def _longest_first(medium: _Medium, heroes: np.ndarray, rays: int) -> np.ndarray:

@@ -83,12 +83,11 @@ def test_dispersion_changes_the_surface(curves):
 
 
 def test_a_tolerance_adds_rays_until_it_is_met_or_says_so(monkeypatch):
-    monkeypatch.setattr(simulation.walker, "BATCH", 4096)
-    met = simulate(Specimen(), NM, tolerance=0.005, key=jax.random.key(1))
-    assert met.standard_error.max() <= 0.005
+    met = simulate(Specimen(), NM, tolerance=0.002, key=jax.random.key(1))
+    assert met.standard_error.max() <= 0.002
     assert met.note == ""
     assert met.rays % simulation.GRAIN == 0
-    assert met.standard_error.max() > 0.9 * 0.005  # no more than are needed
+    assert met.standard_error.max() > 0.9 * 0.002  # no more than are needed
     monkeypatch.setattr(simulation, "MOST_RAYS", 4096)
     short = simulate(Specimen(), NM, tolerance=1e-4, key=jax.random.key(1))
     assert "was not reached with 4,096 rays" in short.note
