@@ -418,7 +418,7 @@ def quick(monkeypatch):
         ("SIZES", {"large": ((32, 32), 1000, "silu"), "small": ((24, 24), 500, "squareplus")}),
         ("LOCAL_HIDDEN", (24, 24)), ("LOCAL_STEPS", 2000),
         ("SPECIMENS", 2048), ("COMPONENTS", 16), ("ORDER_STEPS", 300), ("WAYS", (1, 1)),
-        ("LOOKED_AT", 16),
+        ("LOOKED_AT", 16), ("NEAR", 256),
     ):  # fmt: skip
         monkeypatch.setattr(training, name, value)
 
