@@ -19,9 +19,12 @@ from hylios_fit.units import WAVELENGTH_MAX, WAVELENGTH_MIN
 METHODS = ("walker", "analog", "adding", "surrogate")
 FIRST = 2 * walker.BATCH  # rays before a tolerance is asked for, where no pilot says how many
 FORESEEN = 1.08  # of the rays that a pilot says: it is a little too hopeful
-LOT = 262_144  # rays of one call, at most; every lot keeps lanes waiting for its last rays
+# Rays of one call on a CPU, at most. Every lot keeps lanes waiting for its last rays: few lots cost
+# few core-seconds, and a usual curve keeps two cores busy.
+LOT = 262_144
 GRAIN = 1024  # rays come in multiples of this
 MOST_RAYS = 20_000_000  # where a tolerance stops asking for more
+MANY_RAYS = 2 * LOT  # of which not all set out before some are looked at
 ANALOG_BATCH = 4096
 ABSORB = 0.5  # see `walker.walk`: the answer does not depend on it, the cost does
 
@@ -140,6 +143,7 @@ def _walked(
     plan, own_only = walker.plan_or_own(medium, ABSORB)
     few = tolerance is None and rays < walker.BATCH
     most = rays if few else walker.batch_rays() if own_only else max(walker.batch_rays(), LOT)
+    at_once = 2 if jax.default_backend() == "cpu" else 1
     walk = partial(
         walker.walk, form=specimen.melanosome_form, incidence=angle, rays=most,
         independent=independent,
@@ -150,12 +154,13 @@ def _walked(
         pilot = walk(
             plan.layers, key=other, shares=shares, sent=tally.PILOT, leave=tally.PILOT_LEAVES
         )
-        plan, spread = tally.improve(pilot, plan, medium)
+        plan, variance = tally.improve(pilot, plan, medium)
         if tolerance is not None:
-            more = FORESEEN * float(np.max(1.0 - surface)) ** 2 * spread / tolerance**2
             # fewer say little of their own error, and steady each other not at all
             least = tally.ENOUGH * tally.FOLDS / (tally.FOLDS - 1)
-            more = math.ceil(max(more, least) / GRAIN) * GRAIN
+            needed = FORESEEN * variance * float(np.max((1.0 - surface) / tolerance)) ** 2
+            needed *= 0.9 if needed > MANY_RAYS else 1.0
+            more = math.ceil(min(max(needed, least), MOST_RAYS) / GRAIN) * GRAIN
 
     def lot(part: tuple[int, int]) -> tally.Sums:
         first, many = part
@@ -171,7 +176,7 @@ def _walked(
                 more = min(more, MOST_RAYS - sent)
             # an even number, so that two cores end together; not that of this machine's cores, or
             # the same key would give other paths elsewhere
-            many = 1 if few else 2 * math.ceil(more / most / 2)
+            many = 1 if few else at_once * math.ceil(more / most / at_once)
             each = more if few else math.ceil(more / many / GRAIN) * GRAIN
             lots = [(i, min(each, sent + more - i)) for i in range(sent, sent + more, each)]
             for (_, some), found in zip(lots, side_by_side(lot, lots), strict=True):
@@ -186,7 +191,7 @@ def _walked(
                 # less where much is missing, and at last a little more: the error is an estimate,
                 # and the last rays of every lot leave lanes idle
                 missing = ((np.max(error) / tolerance) ** 2 - 1.0) * sent
-                share = 0.9 if missing > 2 * most else 1.05
+                share = 0.9 if missing > MANY_RAYS else 1.05
                 more = math.ceil(share * missing / GRAIN) * GRAIN
     inside = (1.0 - surface) * np.asarray(total.mean, float)
     return Curve(

@@ -405,7 +405,8 @@ def gather(
     sent: Any = None,
 ) -> Sums:
     """As `collect`, of one lot of several: `tell` what all of them `add` up to, so that a small lot
-    is steadied by what the others know. Not differentiable."""
+    is steadied by what the others know, if `paths` has room for `ENOUGH` rays. Not differentiable.
+    """
     weigher, sent = _to_sum(paths, walked, asked, absorb, own_only, shares, sent)
     return _own_sums(weigher, paths, sent) if own_only else _sums(weigher, paths, sent)[0]
 
@@ -481,13 +482,13 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> tupl
         best = jnp.where(largest < least, now, best)
         # the largest errors lead: the gradient of a high power mean, in steps damped enough that
         # they do not swing
-        lead = (error / largest) ** 16
+        lead = (error / jnp.maximum(largest, TINY**2)) ** 16  # no light, no error
         borne = ray * product(scatter, lead) / product(density, now)
         borne = product(borne, density)
         new = now * (borne / jnp.sum(borne * now)) ** 0.1
         # never nothing: what the pilot missed would weigh without a bound
         new = jnp.maximum(new, 0.2 * shares)
-        return new / jnp.sum(new), best, jnp.minimum(least, largest)
+        return new / jnp.sum(new), best, jnp.where(largest < least, largest, least)
 
     start = (shares, shares, jnp.asarray(jnp.inf, density.dtype))
     return jax.lax.fori_loop(0, 12, better, start)[1:]

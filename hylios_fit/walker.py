@@ -51,9 +51,9 @@ NODES = scattering.LATIMER_ANGLE * np.sqrt(
 FAR = 0.006  # nodes that would weigh no more, from 2.3 gaps away, count nothing
 EASE = 0.002  # added to squares of angles, over the largest, in whose logarithm reflectance is even
 DRAWS = 11  # random numbers that a step may take
-MANY = 10  # particles in a pass through the strata
-# of `_particle_step` before each `_step`, and of that between two exchanges of rays that ended; and
-# both where a pass meets `MANY`
+MANY = 10  # particles in a pass through the strata, in the mean of the columns
+# steps among particles before each step that knows all else, and how many of those between two
+# exchanges of rays that ended
 STEPS, STEPS_AMONG_MANY = (0, 16), (3, 10)
 LANES, ACCELERATOR_LANES = 1024, 1 << 17
 BATCH, ACCELERATOR_BATCH = 65_536, 1 << 19  # rays of one compiled call (`batch_rays`)
@@ -601,12 +601,18 @@ def _sums(lane: _Lane) -> Array:
     return jnp.stack(rows, axis=1)
 
 
-_KINDS = ("independent", "spheroid", "exits", "below")
-
-
 @partial(
     jax.jit,
-    static_argnames=(*_KINDS, "rays", "lanes", "among", "round_length"),
+    static_argnames=(
+        "rays",
+        "independent",
+        "spheroid",
+        "exits",
+        "below",
+        "lanes",
+        "among",
+        "round_length",
+    ),
     compiler_options=COMPILED,
 )
 def _walk(
@@ -678,11 +684,13 @@ def _walk(
         jnp.zeros((rays if exits else 0, 5), dtype),
         jnp.asarray(lanes, jnp.int32),
     )
-    state = jax.lax.while_loop(
-        lambda s: jnp.sum((s[1].phase < ABOVE) & (s[2] < sent), dtype=jnp.int32) > leave,
-        round_,
-        state,
-    )
+
+    def going_on(state):
+        _, lane, place, *_, upcoming = state
+        on_their_way = jnp.sum((lane.phase < ABOVE) & (place < sent), dtype=jnp.int32)
+        return (upcoming < sent) | (on_their_way > leave)
+
+    state = jax.lax.while_loop(going_on, round_, state)
     _, _, _, sums, escaped, end, left, _ = state
     return Paths(sums, escaped, heroes, end), left
 
@@ -709,8 +717,8 @@ def walk(
     overlap the one before or cross a boundary. `incidence` in radians. The same key and numbers
     (`first`, `rays`) give the same paths. `shares` of the rays for each column, by default
     `hero_shares`; or `heroes`, the column of each. Only the first `sent` of them set out, if given:
-    a pilot needs no program of its own. It may `leave` so many on their way: they count as lost,
-    which no answer can take.
+    a pilot needs no program of its own. It may `leave` so many on their way, whose sums stay 0:
+    such paths can plan a walk, and give no answer.
     """
     return _run(
         layers, form, key, incidence, first, rays, absorb, independent, heroes, shares, False,

@@ -148,7 +148,9 @@ def test_light_leaves_an_epidermis_without_absorption_above_or_below():
     assert np.all(np.asarray(lossy[0].mean) + np.asarray(lossy[1].mean) < both)
 
 
-def test_recording_exits_changes_no_path():
+@pytest.mark.parametrize("many", [walker.MANY, 0])
+def test_recording_exits_changes_no_path(monkeypatch, many):
+    monkeypatch.setattr(walker, "MANY", many)
     layers = S3.layers(NM)
     paths, left = walker.walk_out(layers, "complex", KEY, rays=4096)
     for one, two in zip(paths, walker.walk(layers, "complex", KEY, rays=4096), strict=True):

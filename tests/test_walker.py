@@ -414,7 +414,20 @@ def test_of_a_pilot_the_first_rays_set_out(paths, layers):
     assert not np.asarray(few.escaped)[100:].any()
 
 
-def test_both_precisions_agree(found):
+def test_a_pilot_may_leave_its_longest_rays(layers):
+    whole = walk(layers, jax.random.key(1), sent=1000)
+    pilot = walk(layers, jax.random.key(1), sent=1000, leave=50)
+    left = ~np.asarray(pilot.sums)[:1000].any(axis=1)
+    assert 1 <= left.sum() <= 50
+    for part, other in zip(pilot, whole, strict=True):
+        np.testing.assert_array_equal(part[:1000][~left], other[:1000][~left])
+    longest = np.asarray(whole.sums)[:1000, walker.LENGTH].sum(axis=1)
+    assert longest[left].mean() > 2 * longest[~left].mean()
+
+
+@pytest.mark.parametrize("many", [walker.MANY, 0])
+def test_both_precisions_agree(found, monkeypatch, many):
+    monkeypatch.setattr(walker, "MANY", many)
     with jax.enable_x64(True):
         layers = S3.layers(NM, jnp.float64)
         paths = walk(layers, jax.random.key(11))
@@ -461,7 +474,7 @@ def test_steps_among_particles_change_no_path_but_its_draws(monkeypatch):
             for p in (among, plain)
         ]
         seen = np.sum(counts, axis=0) > 20
-        assert stats.chi2_contingency(np.array(counts)[:, seen]).pvalue > 1e-4
+        assert stats.chi2_contingency(np.array(counts)[:, seen])[1] > 1e-4
 
 
 # --- columns that serve a spectrum ---------------------------------------------------------------
@@ -507,6 +520,14 @@ def test_a_plan_gives_what_each_wavelengths_own_rays_give_with_a_smaller_error(s
         z = (np.asarray(one.mean) - np.asarray(own.mean))[known] / spread[known]
         assert np.all(np.abs(z) < 4.5)
         assert stats.chi2.sf(np.sum(z**2), z.size) > 1e-4
+
+
+def test_a_pilot_without_light_plans_as_before(spectrum):
+    plan = walker.plan(spectrum)
+    paths = walk(plan.layers, jax.random.key(21), shares=plan.shares)
+    same, variance = tally.improve(paths._replace(escaped=0.0 * paths.escaped), plan, spectrum)
+    np.testing.assert_array_equal(same.shares, plan.shares)
+    assert variance == 0
 
 
 def several(plan, key, form="complex", lots=4):
