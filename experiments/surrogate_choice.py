@@ -205,7 +205,7 @@ def draw(result: dict[str, Any], path: Any) -> None:
     left.set_yscale("log")
     left.set_ylim(bottom=4e-5)
     left.tick_params(axis="x", labelsize=8, rotation=30)
-    left.legend(fontsize=7, loc="lower left")
+    left.legend(fontsize=7, loc="center left", bbox_to_anchor=(0.0, 0.66))
     title = "dotted: what they learned from"
     _shared.tidy(left, "products for three bands", "RMS error of the reflectance", title)
     points = result["truncated"]
