@@ -278,7 +278,14 @@ def _simulate(args: argparse.Namespace) -> int:
         SIMULATION_HEADER,
         ([f"{value:.7g}" for value in row] for row in zip(*columns, strict=True)),
     )
+    if curve.note:
+        _note(curve.note)
     return _wrote(output)
+
+
+def _note(*notes: str) -> None:
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)
 
 
 def _simulate_exits(
@@ -496,8 +503,7 @@ def _invert(
     from hylios_fit.results import write_posteriors
     from hylios_fit.sampling import sample
 
-    for note in spectra.notes:
-        print(f"note: {note}", file=sys.stderr)
+    _note(*spectra.notes)
     # The key itself, not one derived from it: settings.json then shows the seed that was given.
     key = jax.random.key(seed)
     fits = inversion.fit_many(spectra, surrogate, key=key, progress=True, **options)

@@ -170,6 +170,18 @@ def test_simulate_writes_the_promised_columns(method):
     np.testing.assert_allclose(surface + subsurface, reflectance, rtol=0, atol=2e-6)
 
 
+def test_simulate_says_what_tolerance_it_reached(folder, monkeypatch, capsys):
+    from hylios_fit import adding
+
+    monkeypatch.setattr(adding, "ORDERS", adding.ORDERS[: adding.ORDERS.index(adding.ORDER) + 1])
+    options = ("--method", "adding", "--wavelengths", "500,600", "--tolerance")
+    assert run("simulate", "S3", "-o", "a.csv", *options, 1e-12) == 0
+    said = capsys.readouterr().err
+    assert "note: the tolerance 1e-12 was not reached at order" in said
+    assert run("simulate", "S3", "-o", "a.csv", *options, 0.5) == 0
+    assert "note" not in capsys.readouterr().err
+
+
 def test_simulate_repeats_with_the_seed(folder):
     options = ("--wavelengths", "600", "--rays", 400, "--seed")
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
