@@ -143,7 +143,9 @@ def _walked(
     plan, own_only = walker.plan_or_own(medium, ABSORB)
     few = tolerance is None and rays < walker.BATCH
     most = rays if few else walker.batch_rays() if own_only else max(walker.batch_rays(), LOT)
-    at_once = 2 if jax.default_backend() == "cpu" else 1
+    # two lots, so that two cores end together; not as many as this machine has cores, or the same
+    # key would give other paths elsewhere
+    at_once = 2 if jax.default_backend() == "cpu" and not few else 1
     walk = partial(
         walker.walk, form=specimen.melanosome_form, incidence=angle, rays=most,
         independent=independent,
@@ -174,10 +176,8 @@ def _walked(
         while more:
             if tolerance is not None:
                 more = min(more, MOST_RAYS - sent)
-            # an even number, so that two cores end together; not that of this machine's cores, or
-            # the same key would give other paths elsewhere
-            many = 1 if few else at_once * math.ceil(more / most / at_once)
-            each = more if few else math.ceil(more / many / GRAIN) * GRAIN
+            many = at_once * math.ceil(more / most / at_once)
+            each = math.ceil(more / many / GRAIN) * GRAIN
             lots = [(i, min(each, sent + more - i)) for i in range(sent, sent + more, each)]
             for (_, some), found in zip(lots, side_by_side(lot, lots), strict=True):
                 sums = tally.add(sums, found)

@@ -399,7 +399,6 @@ def gather(
     paths: Paths,
     walked: Layers,
     asked: Layers,
-    absorb: float = 1.0,
     own_only: bool = False,
     shares: Float[Array, "k"] | None = None,
     sent: Any = None,
@@ -407,7 +406,7 @@ def gather(
     """As `collect`, of one lot of several: `tell` what all of them `add` up to, so that a small lot
     is steadied by what the others know, if `paths` has room for `ENOUGH` rays. Not differentiable.
     """
-    weigher, sent = _to_sum(paths, walked, asked, absorb, own_only, shares, sent)
+    weigher, sent = _to_sum(paths, walked, asked, 1.0, own_only, shares, sent)
     return _own_sums(weigher, paths, sent) if own_only else _sums(weigher, paths, sent)[0]
 
 

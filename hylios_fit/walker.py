@@ -310,12 +310,31 @@ def _near(m: _Medium, layer: Array, hero: Array) -> _Near:
     )
 
 
-def _fly(
-    lane: _Lane, m: _Medium, near: _Near, moves: Array, u1: Array, u2: Array
-) -> tuple[Array, Array, Array, Array, Array]:
-    """The way to the next event or interface: which rays cross, are absorbed, meet something; how
-    far they go, and how deep they then are."""
+class _Event(NamedTuple):
+    """What the way to the next event or interface comes to, up to the angle of a hit."""
+
+    draws: tuple[Array, ...]  # the step's uniform numbers
+    distance: Array
+    depth: Array
+    crosses: Array  # comes to an interface
+    absorbed: Array
+    met: Array  # a particle, a fibre or tissue
+    frame: tuple[tuple, tuple]  # at right angles to the direction
+    particle: Array  # met one, which may not be there
+    hit: Array
+    before: Any  # the last particle that was hit
+    ends: Array
+    bends: Array  # a hit asks for an angle, now or again
+    accepted: Array  # the angle stands (Algorithm 1)
+    angle: tuple[Array, Array, Array]  # theta, its cosine and sine
+
+
+def _event(
+    lane: _Lane, m: _Medium, near: _Near, moves: Array, theta_0: Array, step: Array, spheroid: bool
+) -> _Event:
     dtype = lane.depth.dtype
+    draws = _keep(m, *(_uniform(lane.seeds, step, draw, dtype) for draw in range(DRAWS)))
+    u1, u2, u3, u4, u5, _, u7, u8, u9, u10, u11 = draws
     rate = near.event + near.absorb
     ahead = jnp.where(lane.u[2] > 0, near.thickness - lane.depth, lane.depth)
     ahead = ahead / jnp.maximum(jnp.abs(lane.u[2]), 1e-12)
@@ -330,47 +349,39 @@ def _fly(
         jnp.where(moves, jnp.minimum(reach, ahead), 0.0),
     )
     (depth,) = _keep(m, jnp.clip(lane.depth + distance * lane.u[2], 0.0, near.thickness))
-    return crosses, absorbed > 0, met > 0, distance, depth
+    absorbed, met = absorbed > 0, met > 0
 
+    # the particle: where it lies, whether it can be there
+    particle = met & (lane.layer <= 3)
+    p, q = fresnel.basis((lane.u[0], lane.u[1], lane.u[2]))
+    p, q = _keep(m, *p), _keep(m, *q)
+    before, hit = lane.before, particle
+    if before:
+        moved = [b - distance * ui for b, ui in zip(before[:3], lane.u, strict=True)]
+        before = (*_keep(m, *moved), *before[3:])
+        make = _spheroid if spheroid else _sphere
+        new = make(m, near.size, lane.u, p, q, (u5, u9, u4, u11))
+        can = particle & _there(m, new, before, depth, near.thickness)
+        hit = _keep(m, _number(can, dtype))[0] > 0
+        before = tuple(jnp.where(hit, n, o) for n, o in zip(new, before, strict=True))
 
-def _meet(
-    lane: _Lane,
-    m: _Medium,
-    near: _Near,
-    met: Array,
-    distance: Array,
-    depth: Array,
-    p: tuple,
-    q: tuple,
-    xi: tuple,
-    spheroid: bool,
-) -> tuple[Any, Array]:
-    """The particle that rays met, or the one before; and whether it can be where they met it."""
-    before = lane.before
-    if not before:
-        return before, met
-    moved = [b - distance * ui for b, ui in zip(before[:3], lane.u, strict=True)]
-    before = (*_keep(m, *moved), *before[3:])
-    new = (_spheroid if spheroid else _sphere)(m, near.size, lane.u, p, q, xi)
-    can = met & _there(m, new, before, depth, near.thickness)
-    hit = _keep(m, _number(can, depth.dtype))[0] > 0
-    return tuple(jnp.where(hit, n, o) for n, o in zip(new, before, strict=True)), hit
-
-
-def _bend(
-    m: _Medium, theta_0: Array, u7: Array, u8: Array, u10: Array
-) -> tuple[Array, Array, Array, Array]:
-    """A polar angle for a hit, its cosine and sine, and whether it stands (Algorithm 1)."""
     theta = scattering.exponential_proposal(theta_0, u7, u8)
     cos, sin = _keep(m, *_cos_sin(jnp.minimum(0.5 * theta, 0.5 * math.pi)))
-    return theta, cos, sin, scattering.exponential_accepts(theta, sin, u10)
+    return _Event(
+        draws, distance, depth, crosses, absorbed, met, (p, q), particle, hit, before,
+        ends=absorbed | (hit & (u3 >= near.albedo)),
+        bends=hit | (lane.phase == AGAIN),
+        accepted=scattering.exponential_accepts(theta, sin, u10),
+        angle=(theta, cos, sin),
+    )  # fmt: skip
 
 
 def _turned(
-    m: _Medium, u: tuple, p: tuple, q: tuple, cos: Array, sin: Array, xi: Array
+    m: _Medium, u: tuple, event: _Event, cos: Array, sin: Array
 ) -> tuple[Array, Array, Array]:
     """The direction, turned by an angle about a uniform azimuth."""
-    c, s = _keep(m, *_circle(xi))
+    p, q = event.frame
+    c, s = _keep(m, *_circle(event.draws[5]))
     cos, b, c = _keep(m, cos, sin * c, sin * s)
     return fresnel.unit(_keep(m, *_combine(cos, u, b, p, c, q)))
 
@@ -387,41 +398,34 @@ def _particle_step(
     the length, the hits and the particles proposed since its layer was looked up (`near`)."""
     lane, length, hits, proposed = state
     dtype = lane.depth.dtype
-    u1, u2, u3, u4, u5, u6, u7, u8, u9, u10, u11 = _keep(
-        m, *(_uniform(lane.seeds, step, draw, dtype) for draw in range(DRAWS))
-    )
-    layer = lane.layer
-    moves = (lane.phase == FLYING) & (layer >= 1) & (layer <= 3)
-    crosses, absorbed, met, distance, depth = _fly(lane, m, near, moves, u1, u2)
-    p, q = fresnel.basis((lane.u[0], lane.u[1], lane.u[2]))
-    p, q = _keep(m, *p), _keep(m, *q)
-    before, hit = _meet(lane, m, near, met, distance, depth, p, q, (u5, u9, u4, u11), spheroid)
-    ends = absorbed | (hit & (u3 >= near.albedo))
+    moves = (lane.phase == FLYING) & (lane.layer >= 1) & (lane.layer <= 3)
+    event = _event(lane, m, near, moves, theta_0, step, spheroid)
+    theta, cos, sin = event.angle
+    turns = event.bends & event.accepted
+    u = _turned(m, lane.u, event, jnp.where(turns, cos, 1.0), jnp.where(turns, sin, 0.0))
 
-    theta, cos, sin, accepted = _bend(m, theta_0, u7, u8, u10)
-    bends = hit | (lane.phase == AGAIN)
-    turns = bends & accepted
-    cos, sin = jnp.where(turns, cos, 1.0), jnp.where(turns, sin, 0.0)
-    u = _turned(m, lane.u, p, q, cos, sin, u6)
-
-    end = jnp.where(absorbed, ABSORBED, BY_HIT - 1) + layer
-    phase = jnp.where(bends & ~accepted, AGAIN, jnp.where(turns, FLYING, lane.phase))
-    phase = jnp.where(crosses, WAITING, phase)
-    phase = jnp.where(ends, ENDED + end, phase)
+    end = jnp.where(event.absorbed, ABSORBED, BY_HIT - 1) + lane.layer
+    phase = jnp.where(turns, FLYING, jnp.where(event.bends, AGAIN, lane.phase))
+    phase = jnp.where(event.crosses, WAITING, phase)
+    phase = jnp.where(event.ends, ENDED + end, phase)
     lane = lane._replace(
-        depth=depth,
+        depth=event.depth,
         u=u,
         phase=phase,
-        before=before,
-        place=tuple(x + distance * ui for x, ui in zip(lane.place, lane.u, strict=False)),
-        bent=lane.bent + jnp.where(turns & ~ends, theta, 0.0),
+        before=event.before,
+        place=_moved(lane, event),
+        bent=lane.bent + jnp.where(turns & ~event.ends, theta, 0.0),
     )
     return (
         lane,
-        length + distance,
-        hits + _number(hit & ~ends, dtype),
-        proposed + _number(met, dtype),
+        length + event.distance,
+        hits + _number(event.hit & ~event.ends, dtype),
+        proposed + _number(event.particle, dtype),
     )
+
+
+def _moved(lane: _Lane, event: _Event) -> tuple[Array, ...]:
+    return tuple(x + event.distance * ui for x, ui in zip(lane.place, lane.u, strict=False))
 
 
 def _among(
@@ -466,30 +470,22 @@ def _step(
     """Move every ray to its next event or interface, and let that happen."""
     dtype = lane.depth.dtype
     columns = m.event.shape[0] // 7
-    u1, u2, u3, u4, u5, u6, u7, u8, u9, u10, u11 = _keep(
-        m, *(_uniform(lane.seeds, step, draw, dtype) for draw in range(DRAWS))
-    )
-
     layer = lane.layer
     near = _near(m, layer, hero)
-    moves = lane.phase == FLYING
-    crosses, absorbed, met, distance, depth = _fly(lane, m, near, moves, u1, u2)
-    fibre, tissue = met & (layer == 4), met & (layer == 5)
-    met = met & (layer <= 3)
-    p, q = fresnel.basis((lane.u[0], lane.u[1], lane.u[2]))
-    p, q = _keep(m, *p), _keep(m, *q)
-    before, hit = _meet(lane, m, near, met, distance, depth, p, q, (u5, u9, u4, u11), spheroid)
-    ends = absorbed | (hit & (u3 >= near.albedo))
+    event = _event(lane, m, near, lane.phase == FLYING, theta_0, step, spheroid)
+    _, _, u3, _, u5, _, u7, u8, u9, u10, _ = event.draws
+    crosses, distance, depth = event.crosses, event.distance, event.depth
+    hit, bends, accepted, ends = event.hit, event.bends, event.accepted, event.ends
+    fibre, tissue = event.met & (layer == 4), event.met & (layer == 5)
 
     # the new direction
-    theta, cos, sin, accepted = _bend(m, theta_0, u7, u8, u10)
-    bends = hit | (lane.phase == AGAIN)
+    theta, cos, sin = event.angle
     cos_f = jnp.where(tissue, 2.0 * u3 - 1.0, scattering.rayleigh_cosine(u7, u8, u3, u10))
     turns = (bends & accepted) | fibre | tissue
     cos = jnp.where(turns, jnp.where(bends, cos, cos_f), 1.0)
     sin_f = jnp.sqrt(jnp.clip(1.0 - cos_f**2, 0.0, 1.0))
     sin = jnp.where(turns, jnp.where(bends, sin, sin_f), 0.0)
-    u = _turned(m, lane.u, p, q, cos, sin, u6)
+    u = _turned(m, lane.u, event, cos, sin)
 
     # the interface
     here = crosses | (lane.phase == WAITING)
@@ -527,11 +523,11 @@ def _step(
     depth = jnp.where(done, jnp.where(top, 0.0, _thickness(m, layer, hero)), depth)
 
     happened = [hit & ~ends & (lane.layer == i) for i in (1, 2, 3)]
-    happened += [met & (lane.layer == i) for i in (1, 2, 3)]
+    happened += [event.particle & (lane.layer == i) for i in (1, 2, 3)]
     happened += [fibre, tissue, here & bottom]
     over = lane.phase >= ABOVE
     by_medium = ABSORBED + jnp.where(lane.layer == 6, 4, lane.layer)
-    end = jnp.where(absorbed, by_medium, jnp.where(lost, AT_BOTTOM, BY_HIT - 1 + lane.layer))
+    end = jnp.where(event.absorbed, by_medium, jnp.where(lost, AT_BOTTOM, BY_HIT - 1 + lane.layer))
     phase = jnp.where(bends & ~accepted, AGAIN, FLYING)
     phase = jnp.where(here & ~done, WAITING, phase)
     phase = jnp.where(ends | lost, ENDED + end, phase)
@@ -543,8 +539,8 @@ def _step(
         u=u,
         layer=layer,
         phase=jnp.where(over, lane.phase, phase),
-        before=before,
-        place=tuple(x + distance * ui for x, ui in zip(lane.place, lane.u, strict=False)),
+        before=event.before,
+        place=_moved(lane, event),
         lengths=tuple(
             total + jnp.where(lane.layer == i, distance, 0.0)
             for i, total in enumerate(lane.lengths)

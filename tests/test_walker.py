@@ -409,6 +409,7 @@ def test_the_same_key_gives_the_same_paths(paths, layers):
 def test_of_a_pilot_the_first_rays_set_out(paths, layers):
     few = walk(layers, jax.random.key(1), sent=100)
     np.testing.assert_array_equal(few.hero[:100], paths.hero[:100])
+    assert not np.asarray(few.hero)[100:].any()
     assert np.asarray(few.sums)[:100].any(axis=1).all()
     assert not np.asarray(few.sums)[100:].any()
     assert not np.asarray(few.escaped)[100:].any()
