@@ -18,6 +18,7 @@ from hylios_fit.precision import HIGHEST, product
 from hylios_fit.skin import Layers
 from hylios_fit.walker import (
     ENDS,
+    LIFT,
     NEVER,
     NODES,
     SUMS,
@@ -39,6 +40,7 @@ TINY = 1e-9  # and at least this, where no ray knows a column
 FOLDS = 8  # of the rays of a sum: what each takes off the others say
 ENOUGH = 16_384  # rays that say it
 RIDGE = 0.05  # of the second moment of what is known, so that its scatter is not learned
+DARKER = 2.0  # times the absorption of a column: its density, which no ray walks for, is known too
 
 
 class Tally(NamedTuple):
@@ -78,11 +80,13 @@ Lots = TypeVar("Lots", Tally, "Sums")
 class _Weigher(NamedTuple):
     """What turns the sums along a path into its weight; k columns were walked."""
 
-    walked: Array  # (18, k), of the logarithm of the density
-    asked: Array  # (18, w)
+    walked: Array  # (19, k), of the logarithm of the density
+    asked: Array  # (19, w)
     log_share: Array  # (k,)
     nodes: Array | None  # (node, w): what each counts, where `asked` leaves the angles out
     ends: Array | None  # (11, k), of what ended a ray inside, where that is asked for
+    darker: tuple[Array, Array] | None  # the same of columns that absorb more (`DARKER`)
+    of_node: Array  # (k, node): 1 for each column of a node
 
 
 def _weigher(
@@ -106,8 +110,14 @@ def _weigher(
         else:
             nodes = node_shares(asked.theta_0, positive)
     shares = hero_shares(walked.theta_0) if shares is None else shares
-    ends = end_density(walked, absorb) if ended else None
-    return _Weigher(from_walk, asked_for, _log(shares), nodes, ends)
+    ends, darker = None, None
+    if ended:
+        ends, more = end_density(walked, absorb), DARKER * absorb
+        there = log_density(walked, more) - reference + angle_density(walked.theta_0)
+        darker = there, end_density(walked, more)
+    angles = jnp.asarray(NODES, shares.dtype)
+    of_node = (walked.theta_0[:, None] == angles[None]).astype(shares.dtype)
+    return _Weigher(from_walk, asked_for, _log(shares), nodes, ends, darker, of_node)
 
 
 def _log(share: Array) -> Array:
@@ -136,10 +146,27 @@ def _mixed(weigher: _Weigher, paths: Paths) -> tuple[Array, Array]:
 
 def _walked(weigher: _Weigher, paths: Paths) -> Array:
     """(ray, k): logarithm of the density of each path under each column."""
-    each = product(paths.sums, weigher.walked)
-    if weigher.ends is None:
-        return each
-    return each + product(_of(paths.end, ENDS, each.dtype), weigher.ends)
+    return _under(paths, weigher.walked, weigher.ends)
+
+
+def _under(paths: Paths, density: Array, ends: Array | None) -> Array:
+    each = product(paths.sums, density)
+    return each if ends is None else each + product(_of(paths.end, ENDS, each.dtype), ends)
+
+
+def _known(weigher: _Weigher, lift: Array, shares: Array, darker: Array) -> Array:
+    """(ray, k + 2 node) of which the means over all paths are known, whatever was walked: the share
+    of each column in the density; of each node, that share times the `LIFT` of the ray; and what
+    columns that absorb more would have of it."""
+    of_node = weigher.of_node
+    by_node = product(lift[:, None] * shares, of_node), product(darker, of_node)
+    return jnp.concatenate([shares, *by_node], axis=1)
+
+
+def _darker(weigher: _Weigher, paths: Paths) -> Array:
+    """(ray, k): as `_walked`, under columns that absorb more."""
+    assert weigher.darker is not None
+    return _under(paths, *weigher.darker)
 
 
 def _wanted(weigher: _Weigher, paths: Paths, unit: Array) -> Array:
@@ -202,8 +229,8 @@ def _group(rays: int) -> int:
 
 class Sums(NamedTuple):
     """Sums over the rays of each fold (f) and its groups: the rays and groups, the weights (w) and
-    their squares; what each column (k) has of the paths' densities beyond its share; and products
-    of the sums of a group, over its rays. `add` those of lots that share a plan."""
+    their squares; what is known of the paths (k, `_known`) beyond its mean; and products of the sums
+    of a group, over its rays. `add` those of lots that share a plan."""
 
     rays: Float[Array, "f"]
     groups: Float[Array, "f"]
@@ -236,10 +263,16 @@ def _sums(
     """The sums; and (18, w), where slopes are asked for, those along paths times what their weights
     count."""
     width, dtype = weigher.asked.shape[1], weigher.asked.dtype
+
+    def zeros(*shape):
+        return jnp.zeros(shape, dtype)
+
     group = _group(paths.hero.shape[0])
     chunks = _chunks(paths, group)
     size = chunks.hero.shape[1]
-    folds, known = (1, 0) if weigher.ends is None else (FOLDS, weigher.walked.shape[1])
+    share = jnp.exp(weigher.log_share)[None]
+    mean = _known(weigher, zeros(1), share, share)
+    folds, known = (1, 0) if weigher.ends is None else (FOLDS, mean.shape[1])
     # what did not set out is not looked at
     used = (sent + size - 1) // size
 
@@ -248,12 +281,15 @@ def _sums(
 
     def look(i):
         """A chunk; the logarithm of its densities; of each group, how many set out and (k) what
-        the columns have beyond their shares."""
+        is known has beyond its mean."""
         chunk = jax.tree.map(lambda part: part[i], chunks)
         log, shares = _mixed(weigher, chunk)
         set_out = (i * size + jnp.arange(size, dtype=used.dtype) < sent).astype(dtype)
-        beyond = set_out[:, None] * (shares - jnp.exp(weigher.log_share)[None])
-        return chunk, log, grouped(set_out), grouped(beyond[:, :known])
+        if not known:
+            return chunk, log, grouped(set_out), zeros(size // group, 0)
+        darker = jnp.exp(_darker(weigher, chunk) + (weigher.log_share[None] - log[:, None]))
+        beyond = _known(weigher, chunk.sums[:, LIFT], shares, darker) - mean
+        return chunk, log, grouped(set_out), grouped(set_out[:, None] * beyond)
 
     def over(part, zero):
         """The sums of `part` over the chunks of each fold."""
@@ -263,9 +299,6 @@ def _sums(
             return jax.lax.fori_loop(low, high, partial(part, f), zero)
 
         return jax.lax.map(fold, jnp.arange(folds, dtype=used.dtype))
-
-    def zeros(*shape):
-        return jnp.zeros(shape, dtype)
 
     def known_so_far(carry, count, c):
         rays, beyond, beyond2 = carry
@@ -357,7 +390,7 @@ def tell(sums: Sums) -> Tally:
 
 def _factors(rays: Array, beyond: Array, beyond2: Array) -> tuple[Array, Array]:
     """What the weights of a group count in what `tell` sums up, which is linear in them: so much by
-    fold (f,), less (f, k) times what the columns have beyond their shares, by ray."""
+    fold (f,), less (f, k) times what is known has beyond its mean, by ray."""
     tilt = jnp.einsum("fkl,fl->fk", _inverses(rays, beyond2), beyond, precision=HIGHEST)
     level = jnp.sum(tilt * _others(beyond), axis=1) / jnp.maximum(_others(rays), 1.0)
     return 1.0 + _others(level), _others(tilt)
@@ -382,11 +415,13 @@ def collect(
     wavelength: `asked` then has the columns of `walked`.
 
     The densities of all paths under a column of a plan, over those under all columns together, have
-    the mean 1, whatever the column is. Where many rays share a plan, what they are above it in the
-    sample tells how much more light comes back there than should, and that is taken off (control
-    variates of mixtures, Owen and Zhou 2000, doi 10.1080/01621459.2000.10473909). How much it is,
-    every eighth of the rays (`FOLDS`) is told by the others, so that it biases nothing; where
-    hardly any light comes back the mean may fall below 0, within its error.
+    the mean 1, whatever the column is, also one that absorbs more and that no ray walks for; and
+    what chance turned its rays up has the mean 0 (`_known`). Where many rays share a plan, what the
+    sample has beyond these means tells how much more light comes back there than should, and that
+    is taken off (control variates of mixtures, Owen and Zhou 2000,
+    doi 10.1080/01621459.2000.10473909). How much it is, every eighth of the rays (`FOLDS`) is told
+    by the others, so that it biases nothing; where hardly any light comes back the mean may fall
+    below 0, within its error.
     """
     weigher, sent = _to_sum(paths, walked, asked, absorb, own_only, shares, sent)
     if own_only:
@@ -457,6 +492,8 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> tupl
     each = _walked(weigher, paths)
     largest = jnp.max(each, axis=1)
     density = jnp.exp(each - largest[:, None]) * jnp.sign(shares)[None]
+    darker = jnp.exp(_darker(weigher, paths) - largest[:, None]) * jnp.sign(shares)[None]
+    known = _known(weigher, paths.sums[:, LIFT], density, darker)
     wanted = _wanted(weigher, paths, largest)
     sent = _of(paths.hero, len(shares), density.dtype)
     mean_of = sent / jnp.maximum(jnp.sum(sent, axis=0, keepdims=True), 1.0)
@@ -465,12 +502,12 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> tupl
         return x - product(sent, product(mean_of.T, x))
 
     def rest(now):
-        """What each ray counts, and what its weights are off by, as far as no column tells it."""
+        """What each ray counts, and what its weights are off by, as far as nothing that is known tells it."""
         ray, mixed = product(mean_of, now), product(density, now)[:, None]
-        known, weight = about_mean(density / mixed), about_mean(wanted / mixed)
-        moments = product(known.T, ray[:, None] * known)
-        told = _solve(moments, product(known.T, ray[:, None] * weight))
-        return ray, weight - product(known, told)
+        tells, weight = about_mean(known / mixed), about_mean(wanted / mixed)
+        moments = product(tells.T, ray[:, None] * tells)
+        told = _solve(moments, product(tells.T, ray[:, None] * weight))
+        return ray, weight - product(tells, told)
 
     def better(_, state):
         now, best, least = state

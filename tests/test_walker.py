@@ -301,12 +301,12 @@ def test_where_the_angle_falls_shared_paths_agree_with_own(layers):
             assert abs(mean / (2.0 * theta_0) - 1.0) < 0.02 + 4 * error / theta_0
 
 
-def test_node_shares_are_exact_for_parabolas_in_the_logarithm_of_the_square(dtype):
+def test_node_shares_are_exact_for_parabolas(dtype):
     theta_0 = jnp.asarray(scattering.melanosome_angle(np.linspace(700, 1400, 50)), dtype)
     shares = np.asarray(walker.node_shares(theta_0), float)
 
     def place(angle):
-        return np.log((np.asarray(angle, float) / walker.NODES[-1]) ** 2 + walker.EASE)
+        return np.arcsinh(np.asarray(angle, float) / walker.EASE)
 
     for power in range(3):
         exact = place(theta_0) ** power
@@ -538,8 +538,8 @@ def several(plan, key, form="complex", lots=4):
 
 
 @pytest.mark.parametrize(("name", "form"), [("S3", "complex"), ("S4", "dispersed")])
-def test_the_densities_of_all_paths_under_any_column_add_up_to_one(name, form):
-    specimen = Specimen.preset(name).replace(bottom_reflectance=0.7)
+def test_what_is_known_of_all_paths_is_so(name, form):
+    specimen = Specimen.preset(name).replace(bottom_reflectance=0.7, reticular_scattering=5.0)
     plan = walker.plan(specimen.layers(SPECTRUM))
     paths = several(plan, jax.random.key(24), form)
     weigher = tally._weigher(plan.layers, plan.layers, 1.0, plan.shares, ended=True)
@@ -549,10 +549,21 @@ def test_the_densities_of_all_paths_under_any_column_add_up_to_one(name, form):
     z = (density.mean(axis=0) - 1.0) / error
     assert np.all(error < 0.05)
     assert np.abs(z).max() < 4
+    # what a ray is turned up by chance adds up to nothing, under every column; and the densities
+    # under columns that absorb twice as much, which no ray walks for, to one as well
+    of = np.asarray(paths.sums, float)[:, walker.LIFT]
+    lift = of[:, None] * density
+    assert of.std() > 0.3
+    assert np.abs(lift.mean(axis=0) / lift.std(axis=0)).max() * math.sqrt(len(of)) < 4
+    log = np.asarray(tally._mixed(weigher, paths)[0], float)
+    darker = np.exp(np.asarray(tally._darker(weigher, paths), float) - log[:, None])
+    error = darker.std(axis=0) / math.sqrt(len(of))
+    assert np.abs((darker.mean(axis=0) - 1.0) / error).max() < 4
     # every way to end was met, and without what they are the sum is another
     assert np.all(np.bincount(np.asarray(paths.end), minlength=walker.ENDS)[[0, 1, 4, 5, 9, 10]])
     bare = np.asarray(tally._mixed(weigher._replace(ends=None), paths)[1], float) / shares
-    assert np.abs((bare.mean(axis=0) - 1.0) / error).max() > 10
+    error = density.std(axis=0) / math.sqrt(len(density))
+    assert np.abs((bare.mean(axis=0) - 1.0) / error).max() > 6
 
 
 def test_what_the_columns_tell_makes_errors_smaller_and_changes_no_mean(spectrum):
@@ -571,8 +582,9 @@ def test_what_the_columns_tell_makes_errors_smaller_and_changes_no_mean(spectrum
     z = off.mean(axis=0) / (off.std(axis=0, ddof=1) / math.sqrt(len(off)))
     assert np.abs(z).max() < 6  # of Student's t with 11 degrees of freedom
     variance = np.mean(error**2, axis=0) / np.mean(raw_error**2, axis=0)
-    assert variance.max() < 1.1
-    assert np.mean(variance[(SPECTRUM > 750) & (SPECTRUM < 1200)]) < 0.7
+    # to learn 45 numbers from 448 groups costs a ninth where they tell nothing
+    assert variance.max() < 1.2
+    assert np.mean(variance[(SPECTRUM > 750) & (SPECTRUM < 1200)]) < 0.6
     # the errors are those that repeated walks show
     scatter = np.var(steady, axis=0, ddof=1) / np.mean(error**2, axis=0)
     assert 0.7 < scatter.mean() < 1.4
