@@ -37,6 +37,12 @@ def exponential_density(theta: Float[Array, "..."], theta_0: float) -> Float[Arr
     return jnp.exp(-theta / theta_0 - norm) * jnp.sin(theta)
 
 
+def exponential_lost_cosine(theta_0: Float[Array, "..."]) -> Float[Array, "..."]:
+    """1 - the mean cosine of the angle of `exponential_density`; 0 where theta_0 is."""
+    t2, back = theta_0**2, jnp.exp(-jnp.pi / jnp.maximum(theta_0, 1e-6))
+    return (3.0 * t2 + back * (2.0 + 5.0 * t2)) / ((1.0 + 4.0 * t2) * (1.0 + back))
+
+
 def exponential_proposal(
     theta_0: Float[Array, "..."], xi_1: Float[Array, "..."], xi_2: Float[Array, "..."]
 ) -> Float[Array, "..."]:

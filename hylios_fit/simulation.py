@@ -18,7 +18,7 @@ from hylios_fit.units import WAVELENGTH_MAX, WAVELENGTH_MIN
 
 METHODS = ("walker", "analog", "adding", "surrogate")
 FIRST = 2 * walker.BATCH  # rays before a tolerance is asked for, where no pilot says how many
-FORESEEN = 1.22  # of the rays that a pilot says: it is a little too hopeful
+FORESEEN = 1.15  # of the rays that a pilot says: it is a little too hopeful
 # Rays of one call on a CPU, at most. Every lot keeps lanes waiting for its last rays: few lots cost
 # few core-seconds, and a usual curve keeps two cores busy.
 LOT = 262_144

@@ -14,13 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hylios_fit import scattering
 from hylios_fit.precision import HIGHEST, product
 from hylios_fit.skin import Layers
 from hylios_fit.walker import (
     ENDS,
     LIFT,
+    MET,
     NEVER,
     NODES,
+    STEERED,
     SUMS,
     Paths,
     Plan,
@@ -35,7 +38,7 @@ CHUNK, ACCELERATOR_CHUNK = 64, 8192  # rays at a time: memory does not depend on
 GROUP = 64  # rays whose sum counts as one for the errors: columns take turns within it
 GROUPS = 256  # no fewer, or what they say of the errors is noise
 PILOT, PILOT_LEAVES = 4096, 40  # rays that `improve` looks at; how many may be on their way yet
-WATCHED = 128  # wavelengths whose errors shares are chosen by
+WATCHED = 160  # wavelengths whose errors shares are chosen by
 TINY = 1e-9  # and at least this, where no ray knows a column
 FOLDS = 8  # of the rays of a sum: what each takes off the others say
 ENOUGH = 16_384  # rays that say it
@@ -80,13 +83,14 @@ Lots = TypeVar("Lots", Tally, "Sums")
 class _Weigher(NamedTuple):
     """What turns the sums along a path into its weight; k columns were walked."""
 
-    walked: Array  # (19, k), of the logarithm of the density
-    asked: Array  # (19, w)
+    walked: Array  # (21, k), of the logarithm of the density
+    asked: Array  # (21, w)
     log_share: Array  # (k,)
     nodes: Array | None  # (node, w): what each counts, where `asked` leaves the angles out
     ends: Array | None  # (11, k), of what ended a ray inside, where that is asked for
     darker: tuple[Array, Array] | None  # the same of columns that absorb more (`DARKER`)
     of_node: Array  # (k, node): 1 for each column of a node
+    lost_cosine: Array  # (k,), by a hit
 
 
 def _weigher(
@@ -117,7 +121,8 @@ def _weigher(
         darker = there, end_density(walked, more)
     angles = jnp.asarray(NODES, shares.dtype)
     of_node = (walked.theta_0[:, None] == angles[None]).astype(shares.dtype)
-    return _Weigher(from_walk, asked_for, _log(shares), nodes, ends, darker, of_node)
+    lost = scattering.exponential_lost_cosine(walked.theta_0)
+    return _Weigher(from_walk, asked_for, _log(shares), nodes, ends, darker, of_node, lost)
 
 
 def _log(share: Array) -> Array:
@@ -154,12 +159,13 @@ def _under(paths: Paths, density: Array, ends: Array | None) -> Array:
     return each if ends is None else each + product(_of(paths.end, ENDS, each.dtype), ends)
 
 
-def _known(weigher: _Weigher, lift: Array, shares: Array, darker: Array) -> Array:
-    """(ray, k + 2 node) of which the means over all paths are known, whatever was walked: the share
-    of each column in the density; of each node, that share times the `LIFT` of the ray; and what
-    columns that absorb more would have of it."""
-    of_node = weigher.of_node
-    by_node = product(lift[:, None] * shares, of_node), product(darker, of_node)
+def _known(weigher: _Weigher, sums: Array, shares: Array, darker: Array) -> Array:
+    """(ray, k + 3 node) of which the means over all paths are known, whatever was walked: the share
+    of each column in the density; of each node, that share times how far chance turned the ray up
+    at fibres and at hits; and what columns that absorb more would have of it."""
+    hits = sums[:, STEERED, None] + weigher.lost_cosine[None] * sums[:, MET, None]
+    by_column = shares * sums[:, LIFT, None], shares * hits, darker
+    by_node = [product(each, weigher.of_node) for each in by_column]
     return jnp.concatenate([shares, *by_node], axis=1)
 
 
@@ -229,8 +235,8 @@ def _group(rays: int) -> int:
 
 class Sums(NamedTuple):
     """Sums over the rays of each fold (f) and its groups: the rays and groups, the weights (w) and
-    their squares; what is known of the paths (k, `_known`) beyond its mean; and products of the sums
-    of a group, over its rays. `add` those of lots that share a plan."""
+    their squares; what is known of the paths (k, `_known`) beyond its mean; and products of the
+    sums of a group, over its rays. `add` those of lots that share a plan."""
 
     rays: Float[Array, "f"]
     groups: Float[Array, "f"]
@@ -271,7 +277,7 @@ def _sums(
     chunks = _chunks(paths, group)
     size = chunks.hero.shape[1]
     share = jnp.exp(weigher.log_share)[None]
-    mean = _known(weigher, zeros(1), share, share)
+    mean = _known(weigher, zeros(1, SUMS), share, share)
     folds, known = (1, 0) if weigher.ends is None else (FOLDS, mean.shape[1])
     # what did not set out is not looked at
     used = (sent + size - 1) // size
@@ -288,7 +294,7 @@ def _sums(
         if not known:
             return chunk, log, grouped(set_out), zeros(size // group, 0)
         darker = jnp.exp(_darker(weigher, chunk) + (weigher.log_share[None] - log[:, None]))
-        beyond = _known(weigher, chunk.sums[:, LIFT], shares, darker) - mean
+        beyond = _known(weigher, chunk.sums, shares, darker) - mean
         return chunk, log, grouped(set_out), grouped(set_out[:, None] * beyond)
 
     def over(part, zero):
@@ -493,7 +499,7 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> tupl
     largest = jnp.max(each, axis=1)
     density = jnp.exp(each - largest[:, None]) * jnp.sign(shares)[None]
     darker = jnp.exp(_darker(weigher, paths) - largest[:, None]) * jnp.sign(shares)[None]
-    known = _known(weigher, paths.sums[:, LIFT], density, darker)
+    known = _known(weigher, paths.sums, density, darker)
     wanted = _wanted(weigher, paths, largest)
     sent = _of(paths.hero, len(shares), density.dtype)
     mean_of = sent / jnp.maximum(jnp.sum(sent, axis=0, keepdims=True), 1.0)
@@ -502,7 +508,7 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> tupl
         return x - product(sent, product(mean_of.T, x))
 
     def rest(now):
-        """What each ray counts, and what its weights are off by, as far as nothing that is known tells it."""
+        """What each ray counts, and what its weights are off by, beyond what is known tells."""
         ray, mixed = product(mean_of, now), product(density, now)[:, None]
         tells, weight = about_mean(known / mixed), about_mean(wanted / mixed)
         moments = product(tells.T, ray[:, None] * tells)

@@ -42,8 +42,10 @@ HITS = slice(6, 9)  # melanosomes or complexes hit in each stratum, and survived
 PROPOSED = slice(9, 12)  # the same before rejections
 FIBRE, FIBRE_LENGTH, TISSUE, BOTTOM = range(12, 16)
 BENT, STRAIGHT = 16, 17  # sum of the angles of the hits; 1 if there were hits and none bent
-LIFT = 18  # how far chance turned the ray up: 0 in the mean, whatever it walks for (`_lift`)
-SUMS = 19
+# how far chance turned the ray up: by fibres, tissue and the bottom, 0 in the mean (`_lift`); by
+# hits, 0 in the mean with so much of what they met as a hit straightens out (`_steered`)
+LIFT, STEERED, MET = 18, 19, 20
+SUMS = 21
 # What ends a ray inside: its layer, a hit in a stratum, the bottom
 ABSORBED, BY_HIT, AT_BOTTOM, ENDS = 1, 7, 10, 11
 
@@ -69,7 +71,7 @@ class Paths(NamedTuple):
     end: what ended each ray inside, a row of `end_density`; 0 if nothing did.
     """
 
-    sums: Float[Array, "ray 19"]
+    sums: Float[Array, "ray 21"]
     escaped: Float[Array, "ray"]
     hero: Int[Array, "ray"]
     end: Int[Array, "ray"]
@@ -172,7 +174,8 @@ class _Lane(NamedTuple):
     lengths: tuple[Array, ...]  # in each of the seven layers
     counts: tuple[Array, ...]  # hits and proposed in each stratum, fibres, tissue, bottom
     bent: Array  # sum of the angles of the hits
-    lift: Array
+    lift: Array  # how far chance turned it up: `LIFT`, and at hits `STEERED` and `MET`
+    steered: tuple[Array, Array]
 
 
 def _medium(layers: Layers, form: str, absorb: float) -> _Medium:
@@ -394,6 +397,7 @@ def _particle_step(
     near: _Near,
     theta_0: Array,
     step: Array,
+    worth: Array,
     spheroid: bool,
 ) -> tuple[_Lane, Array, Array, Array]:
     """As `_step`, of rays among melanosomes, up to an interface; all others wait. With the lane:
@@ -417,6 +421,7 @@ def _particle_step(
         before=event.before,
         place=_moved(lane, event),
         bent=lane.bent + jnp.where(turns & ~event.ends, theta, 0.0),
+        steered=_steered(lane, u, jnp.where(turns & ~event.ends, theta, 0.0), worth),
     )
     return (
         lane,
@@ -440,11 +445,13 @@ def _among(
     spheroid: bool,
 ) -> _Lane:
     """So many of `_particle_step`, during which no ray changes its layer."""
-    near = _near(m, lane.layer, hero)
+    near, worth = _near(m, lane.layer, hero), _worth(lane)
     zero = jnp.zeros_like(lane.depth)
 
     def one(i, state):
-        return _particle_step(state, m, near, theta_0, first + i.astype(jnp.uint32), spheroid)
+        return _particle_step(
+            state, m, near, theta_0, first + i.astype(jnp.uint32), worth, spheroid
+        )
 
     state: Any = jax.lax.fori_loop(0, steps, one, (lane, zero, zero, zero))
     lane, length, hits, proposed = state
@@ -468,6 +475,7 @@ def _step(
     step: Array,
     spheroid: bool,
     below: int,
+    among: int,
 ) -> _Lane:
     """Move every ray to its next event or interface, and let that happen."""
     dtype = lane.depth.dtype
@@ -487,7 +495,7 @@ def _step(
     cos = jnp.where(turns, jnp.where(bends, cos, cos_f), 1.0)
     sin_f = jnp.sqrt(jnp.clip(1.0 - cos_f**2, 0.0, 1.0))
     sin = jnp.where(turns, jnp.where(bends, sin, sin_f), 0.0)
-    u = _turned(m, lane.u, event, cos, sin)
+    turned = u = _turned(m, lane.u, event, cos, sin)
 
     # the interface
     here = crosses | (lane.phase == WAITING)
@@ -553,6 +561,11 @@ def _step(
         ),
         bent=lane.bent + jnp.where(bends & accepted & ~ends, theta, 0.0),
         lift=lane.lift + lift,
+        steered=_steered(
+            lane, turned, jnp.where(bends & accepted & ~ends, theta, 0.0), _worth(lane)
+        )
+        if among
+        else lane.steered,
     )
 
 
@@ -564,6 +577,20 @@ def _lift(cosine: Array, scattered: Array, u: Array, sent_back: Array, bottoms: 
     # half of the diffuse light from the bottom is that near to the normal
     lift = jnp.where(sent_back, jnp.where(u < 0.5, 0.25, -0.25), lift)
     return worth * lift
+
+
+def _worth(lane: _Lane) -> Array:
+    """How much it matters what hits do now: less deep down, and late."""
+    return (4 - lane.layer).astype(lane.bent.dtype) * jnp.exp(-lane.bent / 30.0)
+
+
+def _steered(lane: _Lane, u: tuple, theta: Array, worth: Array) -> tuple[Array, Array]:
+    """What `STEERED` and `MET` are after hits that bent rays by `theta` to the direction `u`: how
+    much it changed the cosine, upwards, and what that was. A hit leaves the mean cosine of its law
+    of it (`scattering.exponential_lost_cosine`)."""
+    worth = jnp.where(theta > 0, worth, 0.0)
+    steered, met = lane.steered
+    return steered + worth * (lane.u[2] - u[2]), met - worth * lane.u[2]
 
 
 def _facet(m: _Medium, u: Array) -> Array:
@@ -597,18 +624,19 @@ def _start(
         counts=(zero,) * 9,
         bent=zero,
         lift=zero,
+        steered=(zero, zero),
     )
 
 
 def _sums(lane: _Lane) -> Array:
-    """(lane, 19): what adds up along each path."""
+    """(lane, 21): what adds up along each path."""
     first, last = lane.lengths[:4], lane.lengths[5]
     unspent, spent = lane.lengths[4], lane.lengths[6]
     hits, (fibre, tissue, bottom) = lane.counts[:6], lane.counts[6:]
     straight = _number((sum(hits[:3]) > 0) & (lane.bent == 0), lane.bent.dtype)
     rows = (
         *first, unspent + spent, last, *hits, fibre, unspent, tissue, bottom, lane.bent, straight,
-        lane.lift,
+        lane.lift, *lane.steered,
     )  # fmt: skip
     return jnp.stack(rows, axis=1)
 
@@ -663,7 +691,7 @@ def _walk(
             if among:
                 lane = _among(lane, medium, hero, theta_0, step, among, spheroid)
                 step = step + jnp.uint32(among)
-            return step, _step(lane, medium, hero, theta_0, step, spheroid, below)
+            return step, _step(lane, medium, hero, theta_0, step, spheroid, below, among)
 
         step, lane = jax.lax.fori_loop(0, round_length, one, (step, lane))
         ended = (lane.phase >= ABOVE) & (place < sent)
@@ -800,11 +828,12 @@ def batch_rays() -> int:
 
 def _rhythm(medium: _Medium) -> tuple[int, int]:
     """`STEPS`, or `STEPS_AMONG_MANY`: there a ray seldom needs a step that knows all else."""
-    event, thickness = (
-        np.asarray(part).reshape(7, -1)[1:4] for part in (medium.event, medium.thickness)
-    )
-    many = np.mean(np.sum(event * thickness, axis=0)) > MANY
-    return STEPS_AMONG_MANY if many else STEPS
+    parts = (np.asarray(part).reshape(7, -1)[1:4] for part in (medium.event, medium.thickness))
+    return STEPS_AMONG_MANY if _are_many(*parts) else STEPS
+
+
+def _are_many(mu_particle: np.ndarray, thickness: np.ndarray) -> bool:
+    return bool(np.mean(np.sum(mu_particle * thickness, axis=0)) > MANY)
 
 
 def _longest_first(medium: _Medium, heroes: np.ndarray, rays: int) -> np.ndarray:
@@ -888,17 +917,18 @@ LEAST_SHARE = 0.01  # of the rays, for every column that serves anything
 FEW = 0.004  # hits in a straight pass of a stratum without melanosomes
 NOTHING = 1e-12
 NEVER = -1e30
+SPENT, SPENT_AMONG_MANY = 0.4, 0.8  # of the absorption on the way, the rest in the weights
 EDGE = 0.2  # of a column's demand beyond the outermost, or the weights of rare long paths grow
 REACH = 0.6  # how far, in the logarithm of a scattering coefficient, paths serve others well
 
 
-def plan(layers: Layers, absorb: float = 0.4) -> Plan:
+def plan(layers: Layers) -> Plan:
     """Columns that serve the wavelengths of `layers` with few rays, always as many.
 
     Paths that bend at one of `NODES` serve all wavelengths that know it, the better the nearer
     their scattering by fibres and tissue. So each node gets columns at steps of that scattering,
     closer and with more of the rays where a guess of the reflectance says that light comes back.
-    Of the absorption each has the share `absorb` of the least that the wavelengths around it have:
+    Of the absorption each has a share of the least that the wavelengths around it have (`SPENT`):
     the bright ones decide how long rays must live.
     """
     dtype = layers.mu_a.dtype
@@ -907,6 +937,7 @@ def plan(layers: Layers, absorb: float = 0.4) -> Plan:
         **{name: np.asarray(getattr(layers, name), float) for name in Layers._fields}
     )
     depth = wide.thickness[:, None]
+    absorb = SPENT_AMONG_MANY if _are_many(wide.mu_particle[1:4], depth[1:4]) else SPENT
     # four thicknesses: down and up at 60 degrees
     lost = wide.mu_a - wide.mu_particle * np.log(np.maximum(wide.hit_albedo, 1e-30))
     guess = np.exp(-4.0 * np.sum(lost * depth, axis=0)) * wide.bottom
@@ -977,7 +1008,7 @@ def plan_or_own(layers: Layers, absorb: float) -> tuple[Plan, bool]:
     return plan(layers), False
 
 
-def log_density(layers: Layers, absorb: float = 1.0) -> Float[Array, "19 w"]:
+def log_density(layers: Layers, absorb: float = 1.0) -> Float[Array, "21 w"]:
     """Coefficients of the sums along a path in the logarithm of its density at each wavelength.
 
     What does not depend on the wavelength or the contents (directions, facets, positions of
@@ -1024,7 +1055,7 @@ def end_density(layers: Layers, absorb: float = 1.0) -> Float[Array, "11 w"]:
     )
 
 
-def angle_density(theta_0: Float[Array, "w"]) -> Float[Array, "19 w"]:
+def angle_density(theta_0: Float[Array, "w"]) -> Float[Array, "21 w"]:
     """As `log_density`, of the angles by which hits bend the path (`exponential_density`); relative
     to the last of `NODES`."""
     some = theta_0 > 0

@@ -47,6 +47,15 @@ def test_the_exponential_density_is_normalised(theta_0, x64):
     assert np.trapezoid(scattering.exponential_density(t, theta_0), t) == pytest.approx(1, abs=1e-6)
 
 
+@pytest.mark.parametrize("theta_0", [0.01, THETA_0, 1.0])
+def test_what_a_hit_leaves_of_the_cosine(theta_0, x64):
+    t = jnp.linspace(0.0, jnp.pi, 200_001)
+    density = scattering.exponential_density(t, theta_0)
+    mean = np.trapezoid(density * 2.0 * jnp.sin(0.5 * t) ** 2, t)
+    lost = scattering.exponential_lost_cosine(jnp.asarray([theta_0, 0.0]))
+    np.testing.assert_allclose(lost, [mean, 0.0], rtol=1e-5)
+
+
 def test_few_proposals_are_refused(key):
     kept = len(accepted_angles(key, THETA_0, 100_000, jnp.float32)) / 100_000
     assert kept == pytest.approx(0.992, abs=0.002)

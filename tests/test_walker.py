@@ -461,10 +461,10 @@ def test_steps_among_particles_change_no_path_but_its_draws(monkeypatch):
     plain = walk(layers, jax.random.key(14), "dispersed")
     for column in range(3):
         z = []
-        for quantity in ("sums", "escaped"):
+        # but for how hits steered a ray, which plain steps do not look at
+        for quantity in (lambda p: p.sums[:, : walker.STEERED], lambda p: p.escaped):
             one, two = (
-                np.asarray(getattr(p, quantity), float)[np.asarray(p.hero) == column]
-                for p in (among, plain)
+                np.asarray(quantity(p), float)[np.asarray(p.hero) == column] for p in (among, plain)
             )
             error = np.hypot(one.std(axis=0) / len(one) ** 0.5, two.std(axis=0) / len(two) ** 0.5)
             z.append(np.ravel((one.mean(axis=0) - two.mean(axis=0)) / np.maximum(error, 1e-12)))
@@ -555,6 +555,16 @@ def test_what_is_known_of_all_paths_is_so(name, form):
     lift = of[:, None] * density
     assert of.std() > 0.3
     assert np.abs(lift.mean(axis=0) / lift.std(axis=0)).max() * math.sqrt(len(of)) < 4
+    steered, met = np.asarray(paths.sums, float)[:, [walker.STEERED, walker.MET]].T
+    bend = np.asarray(plan.layers.theta_0) > 0
+    if form == "dispersed":  # with few particles nobody looks
+        lost = np.asarray(weigher.lost_cosine, float)[bend]
+        hits = (steered[:, None] + lost * met[:, None]) * density[:, bend]
+        assert np.abs(hits.mean(axis=0) / hits.std(axis=0)).max() * math.sqrt(len(of)) < 4
+        less = (steered[:, None] + 0.7 * lost * met[:, None]) * density[:, bend]
+        assert np.abs(less.mean(axis=0) / less.std(axis=0)).max() * math.sqrt(len(of)) > 10
+    else:
+        assert not np.any(np.stack([steered, met]))
     log = np.asarray(tally._mixed(weigher, paths)[0], float)
     darker = np.exp(np.asarray(tally._darker(weigher, paths), float) - log[:, None])
     error = darker.std(axis=0) / math.sqrt(len(of))
