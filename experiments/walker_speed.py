@@ -202,15 +202,16 @@ def draw(result: dict[str, Any], path: Any) -> None:
     names = list(result["specimens"])
     for i, name in enumerate(names):
         found, colour = result["specimens"][name], _shared.COLOURS[i]
+        goal = result["goal_core_seconds"].get(name)
         bars.bar(i, found["core_seconds"], color=colour)
         bars.annotate(
             f"{found['core_seconds']:.2g} s\n{found['rays'] / 1e3:.0f}k rays",
-            (i, found["core_seconds"]), ha="center", va="bottom", fontsize=8,
+            (i, max(found["core_seconds"], goal or 0.0)),
+            ha="center", va="bottom", fontsize=8,
         )  # fmt: skip
         errors.plot(
             result["wavelength_nm"], found["standard_error"], color=colour, lw=1.2, label=name
         )
-        goal = result["goal_core_seconds"].get(name)
         if goal:
             bars.plot([i - 0.4, i + 0.4], [goal, goal], color="black", ls="--", lw=1)
     bars.set_xticks(range(len(names)), names)
