@@ -167,7 +167,7 @@ def _parts(specimen: Specimen, nm: np.ndarray, key: jax.Array, repeats: int) -> 
         "improve_seconds": _shared.significant(improving, 3),
         "walk_seconds": _shared.significant(walking, 3),
         "collect_seconds": _shared.significant(summing, 3),
-        # of the errors, after what the densities under all columns tell is taken off
+        # of the errors, after what is known of the paths is taken off
         "variance_left": _shared.significant(
             np.asarray(found.standard_error, float) ** 2 / np.maximum(np.diag(covariance), 1e-30), 3
         ),

@@ -109,7 +109,7 @@ def run(seed: int = 0, specimens: int = SPECIMENS, progress: bool = True) -> dic
 
 
 def _told(parts: list[np.ndarray]) -> dict[str, float]:
-    """Of the means after what the columns tell is taken off, as `simulate` gives them, the mean
+    """Of the means after what is known of paths is taken off, as `simulate` gives them, the mean
     square in their standard errors: 1 if they are right. Its own error from specimens, whose
     wavelengths share paths."""
     squares = np.array([np.mean(z[np.isfinite(z)] ** 2) for z in parts if np.isfinite(z).any()])

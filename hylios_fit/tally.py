@@ -47,7 +47,7 @@ DARKER = 2.0  # times the absorption of a column: its density, which no ray walk
 
 
 class Tally(NamedTuple):
-    """Sums over rays that entered the skin, less what the columns tell (`collect`); w wavelengths.
+    """Sums over rays that entered the skin, less what is told (`collect`); w wavelengths.
 
     `squares` has the squared sum of the weights of each group of rays, over their number: columns
     take turns among the rays, so that only the scatter between groups is error. `groups` is their
@@ -119,8 +119,8 @@ def _weigher(
         ends, more = end_density(walked, absorb), DARKER * absorb
         there = log_density(walked, more) - reference + angle_density(walked.theta_0)
         darker = there, end_density(walked, more)
-    angles = jnp.asarray(NODES, shares.dtype)
-    of_node = (walked.theta_0[:, None] == angles[None]).astype(shares.dtype)
+    nodes_walked = jnp.asarray(NODES, walked.theta_0.dtype)
+    of_node = (walked.theta_0[:, None] == nodes_walked[None]).astype(shares.dtype)
     lost = scattering.exponential_lost_cosine(walked.theta_0)
     return _Weigher(from_walk, asked_for, _log(shares), nodes, ends, darker, of_node, lost)
 
@@ -266,7 +266,7 @@ def _(primals, tangents):
 def _sums(
     weigher: _Weigher, paths: Paths, sent: Array, slopes: bool = False
 ) -> tuple[Sums, Array | None]:
-    """The sums; and (18, w), where slopes are asked for, those along paths times what their weights
+    """The sums; and (21, w), where slopes are asked for, those along paths times what their weights
     count."""
     width, dtype = weigher.asked.shape[1], weigher.asked.dtype
 
@@ -314,11 +314,11 @@ def _sums(
     factor = None
     if slopes and known:
 
-        def of_columns(f, i, carry):
+        def of_known(f, i, carry):
             _, _, count, c = look(i)
             return known_so_far(carry, count, c)
 
-        found = over(of_columns, (zeros(), zeros(known), zeros(known, known)))
+        found = over(of_known, (zeros(), zeros(known), zeros(known, known)))
         factor = _factors(*found)
 
     def part(f, i, carry):
@@ -376,7 +376,7 @@ def _inverses(rays: Array, beyond2: Array) -> Array:
 
 @jax.jit
 def tell(sums: Sums) -> Tally:
-    """The sums of all folds, after what the columns tell is taken off the weights and the squares
+    """The sums of all folds, after what is told is taken off the weights and the squares
     of groups: of each fold as much as goes with it in the others."""
     rays, groups = jnp.sum(sums.rays), jnp.sum(sums.groups)
     weight, weight2, squares = (
@@ -498,8 +498,7 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> tupl
     each = _walked(weigher, paths)
     largest = jnp.max(each, axis=1)
     density = jnp.exp(each - largest[:, None]) * jnp.sign(shares)[None]
-    darker = jnp.exp(_darker(weigher, paths) - largest[:, None]) * jnp.sign(shares)[None]
-    known = _known(weigher, paths.sums, density, darker)
+    darker = jnp.exp(_darker(weigher, paths) - largest[:, None])
     wanted = _wanted(weigher, paths, largest)
     sent = _of(paths.hero, len(shares), density.dtype)
     mean_of = sent / jnp.maximum(jnp.sum(sent, axis=0, keepdims=True), 1.0)
@@ -510,7 +509,8 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> tupl
     def rest(now):
         """What each ray counts, and what its weights are off by, beyond what is known tells."""
         ray, mixed = product(mean_of, now), product(density, now)[:, None]
-        tells, weight = about_mean(known / mixed), about_mean(wanted / mixed)
+        known = _known(weigher, paths.sums, density * now / mixed, darker * now / mixed)
+        tells, weight = about_mean(known), about_mean(wanted / mixed)
         moments = product(tells.T, ray[:, None] * tells)
         told = _solve(moments, product(tells.T, ray[:, None] * weight))
         return ray, weight - product(tells, told)

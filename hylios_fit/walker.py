@@ -174,8 +174,8 @@ class _Lane(NamedTuple):
     lengths: tuple[Array, ...]  # in each of the seven layers
     counts: tuple[Array, ...]  # hits and proposed in each stratum, fibres, tissue, bottom
     bent: Array  # sum of the angles of the hits
-    lift: Array  # how far chance turned it up: `LIFT`, and at hits `STEERED` and `MET`
-    steered: tuple[Array, Array]
+    lift: Array  # `LIFT`
+    steered: tuple[Array, Array]  # `STEERED` and `MET`
 
 
 def _medium(layers: Layers, form: str, absorb: float) -> _Medium:
@@ -408,6 +408,7 @@ def _particle_step(
     event = _event(lane, m, near, moves, theta_0, step, spheroid)
     theta, cos, sin = event.angle
     turns = event.bends & event.accepted
+    bend = jnp.where(turns & ~event.ends, theta, 0.0)
     u = _turned(m, lane.u, event, jnp.where(turns, cos, 1.0), jnp.where(turns, sin, 0.0))
 
     end = jnp.where(event.absorbed, ABSORBED, BY_HIT - 1) + lane.layer
@@ -420,8 +421,8 @@ def _particle_step(
         phase=phase,
         before=event.before,
         place=_moved(lane, event),
-        bent=lane.bent + jnp.where(turns & ~event.ends, theta, 0.0),
-        steered=_steered(lane, u, jnp.where(turns & ~event.ends, theta, 0.0), worth),
+        bent=lane.bent + bend,
+        steered=_steered(lane, u, bend, worth),
     )
     return (
         lane,
@@ -475,9 +476,10 @@ def _step(
     step: Array,
     spheroid: bool,
     below: int,
-    among: int,
+    steers: bool,
 ) -> _Lane:
-    """Move every ray to its next event or interface, and let that happen."""
+    """Move every ray to its next event or interface, and let that happen. Whether hits are looked
+    at for how they steer: only where there are many."""
     dtype = lane.depth.dtype
     columns = m.event.shape[0] // 7
     layer = lane.layer
@@ -495,6 +497,7 @@ def _step(
     cos = jnp.where(turns, jnp.where(bends, cos, cos_f), 1.0)
     sin_f = jnp.sqrt(jnp.clip(1.0 - cos_f**2, 0.0, 1.0))
     sin = jnp.where(turns, jnp.where(bends, sin, sin_f), 0.0)
+    bend = jnp.where(bends & accepted & ~ends, theta, 0.0)
     turned = u = _turned(m, lane.u, event, cos, sin)
 
     # the interface
@@ -559,28 +562,25 @@ def _step(
         counts=tuple(
             total + _number(flag, dtype) for flag, total in zip(happened, lane.counts, strict=True)
         ),
-        bent=lane.bent + jnp.where(bends & accepted & ~ends, theta, 0.0),
+        bent=lane.bent + bend,
         lift=lane.lift + lift,
-        steered=_steered(
-            lane, turned, jnp.where(bends & accepted & ~ends, theta, 0.0), _worth(lane)
-        )
-        if among
-        else lane.steered,
+        steered=_steered(lane, turned, bend, _worth(lane)) if steers else lane.steered,
     )
 
 
 def _lift(cosine: Array, scattered: Array, u: Array, sent_back: Array, bottoms: Array) -> Array:
     """How far chance turned a ray up, where it scattered by as much as down (Rayleigh's law and the
-    even one are), or came back from the bottom. The later, the less that matters."""
-    worth = jnp.maximum(1.0 - 0.2 * bottoms, 0.2)
+    even one are), or came back from the bottom. The later, the less that matters: what it counts is
+    known before the draw, or the mean were not 0."""
+    counts = jnp.maximum(1.0 - 0.2 * bottoms, 0.2)
     lift = jnp.where(scattered, -(cosine**3), 0.0)
     # half of the diffuse light from the bottom is that near to the normal
     lift = jnp.where(sent_back, jnp.where(u < 0.5, 0.25, -0.25), lift)
-    return worth * lift
+    return counts * lift
 
 
 def _worth(lane: _Lane) -> Array:
-    """How much it matters what hits do now: less deep down, and late."""
+    """What hits that are to come count in `STEERED` and `MET`: less deep down, and late."""
     return (4 - lane.layer).astype(lane.bent.dtype) * jnp.exp(-lane.bent / 30.0)
 
 
@@ -691,7 +691,7 @@ def _walk(
             if among:
                 lane = _among(lane, medium, hero, theta_0, step, among, spheroid)
                 step = step + jnp.uint32(among)
-            return step, _step(lane, medium, hero, theta_0, step, spheroid, below, among)
+            return step, _step(lane, medium, hero, theta_0, step, spheroid, below, among > 0)
 
         step, lane = jax.lax.fori_loop(0, round_length, one, (step, lane))
         ended = (lane.phase >= ABOVE) & (place < sent)
@@ -917,8 +917,11 @@ LEAST_SHARE = 0.01  # of the rays, for every column that serves anything
 FEW = 0.004  # hits in a straight pass of a stratum without melanosomes
 NOTHING = 1e-12
 NEVER = -1e30
-SPENT, SPENT_AMONG_MANY = 0.4, 0.8  # of the absorption on the way, the rest in the weights
-EDGE = 0.2  # of a column's demand beyond the outermost, or the weights of rare long paths grow
+# of the absorption on the way, the rest in the weights; more where paths are long and cost much
+SPENT, SPENT_AMONG_MANY = 0.4, 0.8
+# of a column's demand, what lies beyond the outermost (and before an only one, where fibres scatter
+# more): further in, rare long paths had weights of hundreds
+EDGE = 0.2
 REACH = 0.6  # how far, in the logarithm of a scattering coefficient, paths serve others well
 
 
@@ -928,8 +931,8 @@ def plan(layers: Layers) -> Plan:
     Paths that bend at one of `NODES` serve all wavelengths that know it, the better the nearer
     their scattering by fibres and tissue. So each node gets columns at steps of that scattering,
     closer and with more of the rays where a guess of the reflectance says that light comes back.
-    Of the absorption each has a share of the least that the wavelengths around it have (`SPENT`):
-    the bright ones decide how long rays must live.
+    Of the absorption each has a share (`SPENT`, `SPENT_AMONG_MANY`) of the least that the
+    wavelengths around it have: the bright ones decide how long rays must live.
     """
     dtype = layers.mu_a.dtype
     used = np.abs(np.asarray(node_shares(layers.theta_0), float))
@@ -1050,7 +1053,8 @@ def end_density(layers: Layers, absorb: float = 1.0) -> Float[Array, "11 w"]:
             0.0 * row,
             log(absorb * layers.mu_a),
             log(1.0 - layers.hit_albedo[1:4] ** absorb),
-            (log(1.0 - kept) - log(kept)) * row,  # the bottom is among the sums
+            # the bottom is among the sums: what `log_density` has of it is taken back
+            (log(1.0 - kept) - absorb * jnp.log(layers.bottom + NOTHING)) * row,
         ]
     )
 

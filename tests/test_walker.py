@@ -531,17 +531,51 @@ def test_a_pilot_without_light_plans_as_before(spectrum):
     assert variance == 0
 
 
-def several(plan, key, form="complex", lots=4):
+def several(plan, key, form="complex", lots=4, independent=False):
     """The paths of a few walks that begin where the one before ended."""
-    found = [walk(plan.layers, key, form, first=i * RAYS, shares=plan.shares) for i in range(lots)]
+    more = {"shares": plan.shares, "independent": independent}
+    found = [walk(plan.layers, key, form, first=i * RAYS, **more) for i in range(lots)]
     return walker.Paths(*(jnp.concatenate(part) for part in zip(*found, strict=True)))
 
 
-@pytest.mark.parametrize(("name", "form"), [("S3", "complex"), ("S4", "dispersed")])
-def test_what_is_known_of_all_paths_is_so(name, form):
-    specimen = Specimen.preset(name).replace(bottom_reflectance=0.7, reticular_scattering=5.0)
+def test_a_plan_of_part_of_a_spectrum_knows_nothing_of_what_it_lacks(spectrum):
+    plan = walker.plan(S3.layers(NM[:3]))
+    paths = walk(plan.layers, jax.random.key(29), shares=plan.shares)
+    sums = tally._sums(
+        tally._weigher(plan.layers, spectrum, 1.0, plan.shares, ended=True), paths, jnp.int32(RAYS)
+    )[0]
+    columns, beyond = sum(walker.COLUMNS), np.asarray(sums.beyond)
+    assert beyond.shape[1] == columns + 3 * len(walker.NODES)
+    assert np.all(np.isfinite(beyond))
+    lacking = np.asarray(plan.shares) == 0
+    assert not np.any(beyond[:, :columns][:, lacking])
+    by_node = beyond[:, columns:].reshape(-1, 3, len(walker.NODES))
+    assert not np.any(by_node[:, :, :-1])
+    assert np.all(by_node[:, [0, 2], -1] != 0)
+
+
+def test_what_ends_at_the_bottom_takes_back_what_the_sums_have_of_it():
+    for bottom in (0.0, 1e-9, 0.3, 1.0):
+        layers = S3.replace(bottom_reflectance=bottom).layers(NM)
+        for absorb in (0.4, 1.0, 2.0):
+            there = walker.log_density(layers, absorb)[walker.BOTTOM]
+            gone = np.exp(np.asarray(there + walker.end_density(layers, absorb)[-1], float))
+            np.testing.assert_allclose(gone, 1.0 - bottom**absorb, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "bottom", "independent"),
+    [
+        ("S3", "complex", 0.7, False),
+        ("S4", "dispersed", 0.7, False),
+        ("S1", "complex", 0.0, False),
+        ("S4", "dispersed", 1.0, True),
+    ],
+)
+def test_what_is_known_of_all_paths_is_so(name, form, bottom, independent):
+    specimen = Specimen.preset(name).replace(bottom_reflectance=bottom, reticular_scattering=5.0)
     plan = walker.plan(specimen.layers(SPECTRUM))
-    paths = several(plan, jax.random.key(24), form)
+    paths = several(plan, jax.random.key(24), form, independent=independent)
     weigher = tally._weigher(plan.layers, plan.layers, 1.0, plan.shares, ended=True)
     shares = np.asarray(plan.shares, float)
     density = np.asarray(tally._mixed(weigher, paths)[1], float) / shares
@@ -557,18 +591,21 @@ def test_what_is_known_of_all_paths_is_so(name, form):
     assert np.abs(lift.mean(axis=0) / lift.std(axis=0)).max() * math.sqrt(len(of)) < 4
     steered, met = np.asarray(paths.sums, float)[:, [walker.STEERED, walker.MET]].T
     bend = np.asarray(plan.layers.theta_0) > 0
-    if form == "dispersed":  # with few particles nobody looks
+    if walker._rhythm(walker._medium(plan.layers, form, 1.0)) != walker.STEPS:
         lost = np.asarray(weigher.lost_cosine, float)[bend]
         hits = (steered[:, None] + lost * met[:, None]) * density[:, bend]
         assert np.abs(hits.mean(axis=0) / hits.std(axis=0)).max() * math.sqrt(len(of)) < 4
         less = (steered[:, None] + 0.7 * lost * met[:, None]) * density[:, bend]
         assert np.abs(less.mean(axis=0) / less.std(axis=0)).max() * math.sqrt(len(of)) > 10
-    else:
+    else:  # with few particles nobody looks
+        assert form == "complex"
         assert not np.any(np.stack([steered, met]))
     log = np.asarray(tally._mixed(weigher, paths)[0], float)
     darker = np.exp(np.asarray(tally._darker(weigher, paths), float) - log[:, None])
     error = darker.std(axis=0) / math.sqrt(len(of))
     assert np.abs((darker.mean(axis=0) - 1.0) / error).max() < 4
+    if bottom != 0.7:
+        return
     # every way to end was met, and without what they are the sum is another
     assert np.all(np.bincount(np.asarray(paths.end), minlength=walker.ENDS)[[0, 1, 4, 5, 9, 10]])
     bare = np.asarray(tally._mixed(weigher._replace(ends=None), paths)[1], float) / shares
@@ -576,7 +613,7 @@ def test_what_is_known_of_all_paths_is_so(name, form):
     assert np.abs((bare.mean(axis=0) - 1.0) / error).max() > 6
 
 
-def test_what_the_columns_tell_makes_errors_smaller_and_changes_no_mean(spectrum):
+def test_what_is_known_makes_errors_smaller_and_changes_no_mean(spectrum):
     plan = walker.plan(spectrum)
     steady, error, raw, raw_error = [], [], [], []
     for number in range(12):
@@ -592,7 +629,8 @@ def test_what_the_columns_tell_makes_errors_smaller_and_changes_no_mean(spectrum
     z = off.mean(axis=0) / (off.std(axis=0, ddof=1) / math.sqrt(len(off)))
     assert np.abs(z).max() < 6  # of Student's t with 11 degrees of freedom
     variance = np.mean(error**2, axis=0) / np.mean(raw_error**2, axis=0)
-    # to learn 45 numbers from 448 groups costs a ninth where they tell nothing
+    # to learn 45 numbers (hits steer nothing here) from 448 groups costs a ninth where they tell
+    # nothing
     assert variance.max() < 1.2
     assert np.mean(variance[(SPECTRUM > 750) & (SPECTRUM < 1200)]) < 0.6
     # the errors are those that repeated walks show
