@@ -509,7 +509,8 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> tupl
     def rest(now):
         """What each ray counts, and what its weights are off by, beyond what is known tells."""
         ray, mixed = product(mean_of, now), product(density, now)[:, None]
-        known = _known(weigher, paths.sums, density * now / mixed, darker * now / mixed)
+        share = now[None] / mixed
+        known = _known(weigher, paths.sums, density * share, darker * share)
         tells, weight = about_mean(known), about_mean(wanted / mixed)
         moments = product(tells.T, ray[:, None] * tells)
         told = _solve(moments, product(tells.T, ray[:, None] * weight))
