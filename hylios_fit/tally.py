@@ -80,6 +80,15 @@ class Tally(NamedTuple):
 Lots = TypeVar("Lots", Tally, "Sums")
 
 
+class _Told(NamedTuple):
+    """What more is needed for `_known`."""
+
+    darker: Array  # (21, k): as `walked`, of columns that absorb more (`DARKER`)
+    ends: Array  # (11, k), of what ended a ray inside there
+    of_node: Array  # (k, node): 1 for each column of a node
+    lost_cosine: Array  # (k,), by a hit
+
+
 class _Weigher(NamedTuple):
     """What turns the sums along a path into its weight; k columns were walked."""
 
@@ -88,9 +97,7 @@ class _Weigher(NamedTuple):
     log_share: Array  # (k,)
     nodes: Array | None  # (node, w): what each counts, where `asked` leaves the angles out
     ends: Array | None  # (11, k), of what ended a ray inside, where that is asked for
-    darker: tuple[Array, Array] | None  # the same of columns that absorb more (`DARKER`)
-    of_node: Array  # (k, node): 1 for each column of a node
-    lost_cosine: Array  # (k,), by a hit
+    told: _Told | None  # there as well
 
 
 def _weigher(
@@ -114,15 +121,17 @@ def _weigher(
         else:
             nodes = node_shares(asked.theta_0, positive)
     shares = hero_shares(walked.theta_0) if shares is None else shares
-    ends, darker = None, None
+    ends, told = None, None
     if ended:
         ends, more = end_density(walked, absorb), DARKER * absorb
-        there = log_density(walked, more) - reference + angle_density(walked.theta_0)
-        darker = there, end_density(walked, more)
-    nodes_walked = jnp.asarray(NODES, walked.theta_0.dtype)
-    of_node = (walked.theta_0[:, None] == nodes_walked[None]).astype(shares.dtype)
-    lost = scattering.exponential_lost_cosine(walked.theta_0)
-    return _Weigher(from_walk, asked_for, _log(shares), nodes, ends, darker, of_node, lost)
+        nodes_walked = jnp.asarray(NODES, walked.theta_0.dtype)
+        told = _Told(
+            log_density(walked, more) - reference + angle_density(walked.theta_0),
+            end_density(walked, more),
+            (walked.theta_0[:, None] == nodes_walked[None]).astype(shares.dtype),
+            scattering.exponential_lost_cosine(walked.theta_0),
+        )
+    return _Weigher(from_walk, asked_for, _log(shares), nodes, ends, told)
 
 
 def _log(share: Array) -> Array:
@@ -159,20 +168,14 @@ def _under(paths: Paths, density: Array, ends: Array | None) -> Array:
     return each if ends is None else each + product(_of(paths.end, ENDS, each.dtype), ends)
 
 
-def _known(weigher: _Weigher, sums: Array, shares: Array, darker: Array) -> Array:
+def _known(told: _Told, sums: Array, shares: Array, darker: Array) -> Array:
     """(ray, k + 3 node) of which the means over all paths are known, whatever was walked: the share
     of each column in the density; of each node, that share times how far chance turned the ray up
     at fibres and at hits; and what columns that absorb more would have of it."""
-    hits = sums[:, STEERED, None] + weigher.lost_cosine[None] * sums[:, MET, None]
+    hits = sums[:, STEERED, None] + told.lost_cosine[None] * sums[:, MET, None]
     by_column = shares * sums[:, LIFT, None], shares * hits, darker
-    by_node = [product(each, weigher.of_node) for each in by_column]
+    by_node = [product(each, told.of_node) for each in by_column]
     return jnp.concatenate([shares, *by_node], axis=1)
-
-
-def _darker(weigher: _Weigher, paths: Paths) -> Array:
-    """(ray, k): as `_walked`, under columns that absorb more."""
-    assert weigher.darker is not None
-    return _under(paths, *weigher.darker)
 
 
 def _wanted(weigher: _Weigher, paths: Paths, unit: Array) -> Array:
@@ -276,9 +279,11 @@ def _sums(
     group = _group(paths.hero.shape[0])
     chunks = _chunks(paths, group)
     size = chunks.hero.shape[1]
-    share = jnp.exp(weigher.log_share)[None]
-    mean = _known(weigher, zeros(1, SUMS), share, share)
-    folds, known = (1, 0) if weigher.ends is None else (FOLDS, mean.shape[1])
+    folds, known, told = 1, 0, weigher.told
+    if told is not None:
+        share = jnp.exp(weigher.log_share)[None]
+        mean = _known(told, zeros(1, SUMS), share, share)
+        folds, known = FOLDS, mean.shape[1]
     # what did not set out is not looked at
     used = (sent + size - 1) // size
 
@@ -291,10 +296,11 @@ def _sums(
         chunk = jax.tree.map(lambda part: part[i], chunks)
         log, shares = _mixed(weigher, chunk)
         set_out = (i * size + jnp.arange(size, dtype=used.dtype) < sent).astype(dtype)
-        if not known:
+        if told is None:
             return chunk, log, grouped(set_out), zeros(size // group, 0)
-        darker = jnp.exp(_darker(weigher, chunk) + (weigher.log_share[None] - log[:, None]))
-        beyond = _known(weigher, chunk.sums, shares, darker) - mean
+        darker = _under(chunk, told.darker, told.ends)
+        darker = jnp.exp(darker + (weigher.log_share[None] - log[:, None]))
+        beyond = _known(told, chunk.sums, shares, darker) - mean
         return chunk, log, grouped(set_out), grouped(set_out[:, None] * beyond)
 
     def over(part, zero):
@@ -498,7 +504,9 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> tupl
     each = _walked(weigher, paths)
     largest = jnp.max(each, axis=1)
     density = jnp.exp(each - largest[:, None]) * jnp.sign(shares)[None]
-    darker = jnp.exp(_darker(weigher, paths) - largest[:, None])
+    told_by = weigher.told
+    assert told_by is not None
+    darker = jnp.exp(_under(paths, told_by.darker, told_by.ends) - largest[:, None])
     wanted = _wanted(weigher, paths, largest)
     sent = _of(paths.hero, len(shares), density.dtype)
     mean_of = sent / jnp.maximum(jnp.sum(sent, axis=0, keepdims=True), 1.0)
@@ -510,7 +518,7 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> tupl
         """What each ray counts, and what its weights are off by, beyond what is known tells."""
         ray, mixed = product(mean_of, now), product(density, now)[:, None]
         share = now[None] / mixed
-        known = _known(weigher, paths.sums, density * share, darker * share)
+        known = _known(told_by, paths.sums, density * share, darker * share)
         tells, weight = about_mean(known), about_mean(wanted / mixed)
         moments = product(tells.T, ray[:, None] * tells)
         told = _solve(moments, product(tells.T, ray[:, None] * weight))

@@ -7,7 +7,8 @@ density of a path under any other wavelength or content is the exponential of on
 `log_density`. A ray that gets out therefore serves all wavelengths, weighted by its density there
 over the mean of its densities under all columns that were walked (the balance heuristic, Veach and
 Guibas 1995; hero wavelengths, Wilkie et al. 2014). `plan` chooses columns that serve a whole
-spectrum with few rays. The weights are bounded, and `tally` does the sums.
+spectrum with few rays; between them weights are bounded, beyond them large ones are rare (`EDGE`).
+`tally` does the sums, and states the error.
 
 Two things differ from the letter of the paper (`analog`):
 - The inside of a melanosome is averaged: a hit costs its mean survival, tabulated from the literal

@@ -577,6 +577,8 @@ def test_what_is_known_of_all_paths_is_so(name, form, bottom, independent):
     plan = walker.plan(specimen.layers(SPECTRUM))
     paths = several(plan, jax.random.key(24), form, independent=independent)
     weigher = tally._weigher(plan.layers, plan.layers, 1.0, plan.shares, ended=True)
+    told = weigher.told
+    assert told is not None
     shares = np.asarray(plan.shares, float)
     density = np.asarray(tally._mixed(weigher, paths)[1], float) / shares
     error = density.std(axis=0) / math.sqrt(len(density))
@@ -592,7 +594,7 @@ def test_what_is_known_of_all_paths_is_so(name, form, bottom, independent):
     steered, met = np.asarray(paths.sums, float)[:, [walker.STEERED, walker.MET]].T
     bend = np.asarray(plan.layers.theta_0) > 0
     if walker._rhythm(walker._medium(plan.layers, form, 1.0)) != walker.STEPS:
-        lost = np.asarray(weigher.lost_cosine, float)[bend]
+        lost = np.asarray(told.lost_cosine, float)[bend]
         hits = (steered[:, None] + lost * met[:, None]) * density[:, bend]
         assert np.abs(hits.mean(axis=0) / hits.std(axis=0)).max() * math.sqrt(len(of)) < 4
         less = (steered[:, None] + 0.7 * lost * met[:, None]) * density[:, bend]
@@ -601,15 +603,15 @@ def test_what_is_known_of_all_paths_is_so(name, form, bottom, independent):
         assert form == "complex"
         assert not np.any(np.stack([steered, met]))
     log = np.asarray(tally._mixed(weigher, paths)[0], float)
-    darker = np.exp(np.asarray(tally._darker(weigher, paths), float) - log[:, None])
-    error = darker.std(axis=0) / math.sqrt(len(of))
-    assert np.abs((darker.mean(axis=0) - 1.0) / error).max() < 4
+    darker = np.asarray(tally._under(paths, told.darker, told.ends), float)
+    darker = np.exp(darker - log[:, None])
+    off = (darker.mean(axis=0) - 1.0) / darker.std(axis=0) * math.sqrt(len(of))
+    assert np.abs(off).max() < 4
     if bottom != 0.7:
         return
     # every way to end was met, and without what they are the sum is another
     assert np.all(np.bincount(np.asarray(paths.end), minlength=walker.ENDS)[[0, 1, 4, 5, 9, 10]])
     bare = np.asarray(tally._mixed(weigher._replace(ends=None), paths)[1], float) / shares
-    error = density.std(axis=0) / math.sqrt(len(density))
     assert np.abs((bare.mean(axis=0) - 1.0) / error).max() > 6
 
 
