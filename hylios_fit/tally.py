@@ -18,6 +18,7 @@ from hylios_fit import scattering
 from hylios_fit.precision import HIGHEST, product
 from hylios_fit.skin import Layers
 from hylios_fit.walker import (
+    BENT,
     ENDS,
     LIFT,
     MET,
@@ -34,7 +35,8 @@ from hylios_fit.walker import (
     node_shares,
 )
 
-CHUNK, ACCELERATOR_CHUNK = 64, 8192  # rays at a time: memory does not depend on their number
+# rays at a time, so that memory does not depend on their number; by all wavelengths, and otherwise
+CHUNK, PIECE, LOOK, ACCELERATOR_CHUNK = 64, 32, 512, 8192
 GROUP = 64  # rays whose sum counts as one for the errors: columns take turns within it
 GROUPS = 256  # no fewer, or what they say of the errors is noise
 PILOT, PILOT_LEAVES = 4096, 40  # rays that `improve` looks at; how many may be on their way yet
@@ -57,7 +59,6 @@ class Tally(NamedTuple):
     rays: Float[Array, ""]
     groups: Float[Array, ""]
     weight: Float[Array, "w"]
-    weight2: Float[Array, "w"]
     squares: Float[Array, "w"]
 
     @property
@@ -73,8 +74,16 @@ class Tally(NamedTuple):
 
     @property
     def effective_rays(self) -> Float[Array, "w"]:
-        """Effective number of the rays that came back: (sum w)^2 / sum w^2."""
-        return self.weight**2 / jnp.maximum(self.weight2, 1e-30)
+        """How many rays of equal weight would have come back for the same error.
+
+        Among uncorrelated weights that is (sum w)^2 / sum w^2.
+        """
+        return effective_rays(self.mean, self.standard_error, self.rays)
+
+
+def effective_rays(mean: Any, standard_error: Any, rays: Any) -> Any:
+    """Of a mean over `rays`: see `Tally.effective_rays`."""
+    return rays * mean**2 / (rays * standard_error**2 + mean**2 + TINY**2)
 
 
 Lots = TypeVar("Lots", Tally, "Sums")
@@ -83,8 +92,7 @@ Lots = TypeVar("Lots", Tally, "Sums")
 class _Told(NamedTuple):
     """What more is needed for `_known`."""
 
-    darker: Array  # (21, k): as `walked`, of columns that absorb more (`DARKER`)
-    ends: Array  # (11, k), of what ended a ray inside there
+    darker: Array  # (32, k): as `walked`, of columns that absorb more (`DARKER`)
     of_node: Array  # (k, node): 1 for each column of a node
     lost_cosine: Array  # (k,), by a hit
 
@@ -92,12 +100,12 @@ class _Told(NamedTuple):
 class _Weigher(NamedTuple):
     """What turns the sums along a path into its weight; k columns were walked."""
 
-    walked: Array  # (21, k), of the logarithm of the density
+    walked: Array  # (21, k), of the logarithm of the density; then (11, k) of what ended a ray
+    # inside, where that is asked for
     asked: Array  # (21, w)
     log_share: Array  # (k,)
     nodes: Array | None  # (node, w): what each counts, where `asked` leaves the angles out
-    ends: Array | None  # (11, k), of what ended a ray inside, where that is asked for
-    told: _Told | None  # there as well
+    told: _Told | None  # where ends are asked for
 
 
 def _weigher(
@@ -121,17 +129,17 @@ def _weigher(
         else:
             nodes = node_shares(asked.theta_0, positive)
     shares = hero_shares(walked.theta_0) if shares is None else shares
-    ends, told = None, None
+    told = None
     if ended:
-        ends, more = end_density(walked, absorb), DARKER * absorb
-        nodes_walked = jnp.asarray(NODES, walked.theta_0.dtype)
+        more, nodes_walked = DARKER * absorb, jnp.asarray(NODES, walked.theta_0.dtype)
+        darker = log_density(walked, more) - reference + angle_density(walked.theta_0)
+        from_walk = jnp.concatenate([from_walk, end_density(walked, absorb)])
         told = _Told(
-            log_density(walked, more) - reference + angle_density(walked.theta_0),
-            end_density(walked, more),
+            jnp.concatenate([darker, end_density(walked, more)]),
             (walked.theta_0[:, None] == nodes_walked[None]).astype(shares.dtype),
             scattering.exponential_lost_cosine(walked.theta_0),
         )
-    return _Weigher(from_walk, asked_for, _log(shares), nodes, ends, told)
+    return _Weigher(from_walk, asked_for, _log(shares), nodes, told)
 
 
 def _log(share: Array) -> Array:
@@ -145,27 +153,29 @@ def _of(kind: Array, kinds: int, dtype: Any) -> Array:
 
 def _weights(weigher: _Weigher, paths: Paths) -> Array:
     """(ray, w)"""
-    return _wanted(weigher, paths, _mixed(weigher, paths)[0])
+    return _density(weigher, *_ready(weigher, paths, _mixed(weigher, paths)[0]))
 
 
 def _mixed(weigher: _Weigher, paths: Paths) -> tuple[Array, Array]:
     """(ray,), the logarithm of the density of each path under all columns together; and (ray, k),
     what each column has of it."""
-    each = _walked(weigher, paths) + weigher.log_share[None]
+    return _mix(_under(paths, weigher.walked), weigher)
+
+
+def _mix(each: Array, weigher: _Weigher) -> tuple[Array, Array]:
+    each = each + weigher.log_share[None]
     largest = jnp.max(each, axis=1)
     each = jnp.exp(each - largest[:, None])
     total = jnp.sum(each, axis=1)
     return largest + jnp.log(total), each / total[:, None]
 
 
-def _walked(weigher: _Weigher, paths: Paths) -> Array:
+def _under(paths: Paths, density: Array) -> Array:
     """(ray, k): logarithm of the density of each path under each column."""
-    return _under(paths, weigher.walked, weigher.ends)
-
-
-def _under(paths: Paths, density: Array, ends: Array | None) -> Array:
-    each = product(paths.sums, density)
-    return each if ends is None else each + product(_of(paths.end, ENDS, each.dtype), ends)
+    rows = paths.sums
+    if density.shape[0] > SUMS:
+        rows = jnp.concatenate([rows, _of(paths.end, ENDS, rows.dtype)], axis=1)
+    return product(rows, density)
 
 
 def _known(told: _Told, sums: Array, shares: Array, darker: Array) -> Array:
@@ -178,20 +188,26 @@ def _known(told: _Told, sums: Array, shares: Array, darker: Array) -> Array:
     return jnp.concatenate([shares, *by_node], axis=1)
 
 
-def _wanted(weigher: _Weigher, paths: Paths, unit: Array) -> Array:
-    """(ray, w): density of each path that came back, where exp(`unit`) is 1."""
+def _ready(weigher: _Weigher, paths: Paths, unit: Array) -> tuple[Array, Array | None]:
+    """What `_density` takes of each path, where exp(`unit`) is 1: (ray, 22) of its exponent, or
+    (ray, 17) and (ray, node) of the angles."""
+    sums, angles = paths.sums, None
     if weigher.nodes is not None:
-        nodes = jnp.asarray(NODES, unit.dtype)
-        angles = product(paths.sums, angle_density(nodes))
+        angles = product(sums, angle_density(jnp.asarray(NODES, unit.dtype)))
         largest = jnp.max(angles, axis=1)
         angles = jnp.exp(angles - largest[:, None])
-        unit = unit - largest
+        sums, unit = sums[:, :BENT], unit - largest
     # inside the exponential, so that gradients of rays that ended within stay finite
     unit = jnp.where(paths.escaped > 0, unit, -NEVER)
+    return jnp.concatenate([sums, -unit[:, None]], axis=1), angles
+
+
+def _density(weigher: _Weigher, exponent: Array, angles: Array | None) -> Array:
+    """(ray, w): density of each path that came back."""
     one = jnp.ones((1, weigher.asked.shape[1]), weigher.asked.dtype)
-    columns = jnp.concatenate([paths.sums, -unit[:, None]], axis=1)
-    density = jnp.exp(product(columns, jnp.concatenate([weigher.asked, one])))
-    return density if weigher.nodes is None else density * product(angles, weigher.nodes)
+    density = jnp.concatenate([weigher.asked[: exponent.shape[1] - 1], one])
+    density = jnp.exp(product(exponent, density))
+    return density if angles is None else density * product(angles, weigher.nodes)
 
 
 def _own_weights(weigher: _Weigher, paths: Paths) -> Array:
@@ -214,11 +230,11 @@ def _sum_own_weights(weigher: _Weigher, paths: Paths, columns: int) -> tuple[Arr
     return total[:, 0], total[:, 1]
 
 
-def _chunks(paths: Paths, group: int = 1) -> Paths:
-    """The rays by `CHUNK` or `ACCELERATOR_CHUNK`, whole groups; what fills the last one never came
+def _chunks(paths: Paths, most: int = CHUNK, group: int = 1) -> Paths:
+    """The rays by `most` or `ACCELERATOR_CHUNK`, whole groups; what fills the last one never came
     out."""
     rays = paths.hero.shape[0]
-    most = CHUNK if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK
+    most = most if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK
     size = min(most, rays + -rays % group)
     padding = -rays % size
     return Paths(
@@ -237,14 +253,13 @@ def _group(rays: int) -> int:
 
 
 class Sums(NamedTuple):
-    """Sums over the rays of each fold (f) and its groups: the rays and groups, the weights (w) and
-    their squares; what is known of the paths (k, `_known`) beyond its mean; and products of the
+    """Sums over the rays of each fold (f) and its groups: the rays and groups, the weights (w); what
+    is known of the paths (k, `_known`) beyond its mean; and products of the
     sums of a group, over its rays. `add` those of lots that share a plan."""
 
     rays: Float[Array, "f"]
     groups: Float[Array, "f"]
     weight: Float[Array, "f w"]
-    weight2: Float[Array, "f w"]
     squares: Float[Array, "f w"]
     beyond: Float[Array, "f k"]
     beyond2: Float[Array, "f k k"]
@@ -277,10 +292,14 @@ def _sums(
         return jnp.zeros(shape, dtype)
 
     group = _group(paths.hero.shape[0])
-    chunks = _chunks(paths, group)
+    chunks = _chunks(paths, LOOK, group)
     size = chunks.hero.shape[1]
+    cut = jax.default_backend() == "cpu" and size % PIECE == 0
+    part_of_chunk, part_of_group = (PIECE, min(PIECE, group)) if cut else (size, group)
     folds, known, told = 1, 0, weigher.told
+    both = weigher.walked
     if told is not None:
+        both = jnp.concatenate([both, told.darker], axis=1)
         share = jnp.exp(weigher.log_share)[None]
         mean = _known(told, zeros(1, SUMS), share, share)
         folds, known = FOLDS, mean.shape[1]
@@ -288,17 +307,18 @@ def _sums(
     used = (sent + size - 1) // size
 
     def grouped(x):
-        return jnp.sum(x.reshape(size // group, group, *x.shape[1:]), axis=1)
+        return jnp.sum(x.reshape(-1, group, *x.shape[1:]), axis=1)
 
     def look(i):
         """A chunk; the logarithm of its densities; of each group, how many set out and (k) what
         is known has beyond its mean."""
         chunk = jax.tree.map(lambda part: part[i], chunks)
-        log, shares = _mixed(weigher, chunk)
+        each = _under(chunk, both)
+        log, shares = _mix(each[:, : weigher.walked.shape[1]], weigher)
         set_out = (i * size + jnp.arange(size, dtype=used.dtype) < sent).astype(dtype)
         if told is None:
             return chunk, log, grouped(set_out), zeros(size // group, 0)
-        darker = _under(chunk, told.darker, told.ends)
+        darker = each[:, weigher.walked.shape[1] :]
         darker = jnp.exp(darker + (weigher.log_share[None] - log[:, None]))
         beyond = _known(told, chunk.sums, shares, darker) - mean
         return chunk, log, grouped(set_out), grouped(set_out[:, None] * beyond)
@@ -330,23 +350,31 @@ def _sums(
     def part(f, i, carry):
         carry, by_sum = carry
         chunk, log, count, c = look(i)
-        weight = _wanted(weigher, chunk, log)
-        w = grouped(weight)
-        inverse = 1.0 / jnp.maximum(count, 1.0)[:, None]
-        scaled = c * inverse
+        scaled = c / jnp.maximum(count, 1.0)[:, None]
+        some: tuple[Any, ...] = _ready(weigher, chunk, log)
         if by_sum is not None:
-            counts = weight
+            counts = jnp.ones(size, dtype)
             if factor is not None:
                 level, tilt = factor
-                counts = weight * jnp.repeat(level[f] - product(scaled, tilt[f]), group)[:, None]
-            by_sum = by_sum + product(chunk.sums.T, counts)
+                counts = jnp.repeat(level[f] - product(scaled, tilt[f]), group)
+            some = *some, chunk.sums * counts[:, None]
+
+        def piece(by_sum, some):
+            exponent, angles, *sums = some
+            weight = _density(weigher, exponent, angles)
+            if by_sum is not None:
+                by_sum = by_sum + product(sums[0].T, weight)
+            return by_sum, jnp.sum(weight.reshape(-1, part_of_group, width), axis=1)
+
+        pieces = jax.tree.map(lambda x: x.reshape(-1, part_of_chunk, *x.shape[1:]), some)
+        by_sum, w = jax.lax.scan(piece, by_sum, pieces)
+        w = jnp.sum(w.reshape(size // group, -1, width), axis=1)
         rays, beyond, beyond2 = known_so_far((carry.rays, carry.beyond, carry.beyond2), count, c)
         found = Sums(
             rays,
             carry.groups + jnp.sum((count > 0).astype(dtype)),
             carry.weight + jnp.sum(w, axis=0),
-            carry.weight2 + jnp.sum(weight**2, axis=0),
-            carry.squares + jnp.sum(w**2 * inverse, axis=0),
+            carry.squares + jnp.sum(w**2 / jnp.maximum(count, 1.0)[:, None], axis=0),
             beyond,
             beyond2,
             carry.cross + product(scaled.T, w),
@@ -354,7 +382,7 @@ def _sums(
         return found, by_sum
 
     zero = Sums(
-        zeros(), zeros(), zeros(width), zeros(width), zeros(width), zeros(known),
+        zeros(), zeros(), zeros(width), zeros(width), zeros(known),
         zeros(known, known), zeros(known, width),
     )  # fmt: skip
     found, by_sum = over(part, (zero, zeros(SUMS, width) if slopes else None))
@@ -385,9 +413,7 @@ def tell(sums: Sums) -> Tally:
     """The sums of all folds, after what is told is taken off the weights and the squares
     of groups: of each fold as much as goes with it in the others."""
     rays, groups = jnp.sum(sums.rays), jnp.sum(sums.groups)
-    weight, weight2, squares = (
-        jnp.sum(x, axis=0) for x in (sums.weight, sums.weight2, sums.squares)
-    )
+    weight, squares = jnp.sum(sums.weight, axis=0), jnp.sum(sums.squares, axis=0)
     if sums.beyond.shape[1]:
         others, beyond, light, cross = (
             _others(x) for x in (sums.rays, sums.beyond, sums.weight, sums.cross)
@@ -397,7 +423,7 @@ def tell(sums: Sums) -> Tally:
         weight = weight - jnp.einsum("fk,fkw->w", sums.beyond, controls, precision=HIGHEST)
         twice = product(sums.beyond2, controls) - 2.0 * sums.cross
         squares = squares + jnp.sum(twice * controls, axis=(0, 1))
-    return Tally(rays, groups, weight, weight2, squares)
+    return Tally(rays, groups, weight, squares)
 
 
 def _factors(rays: Array, beyond: Array, beyond2: Array) -> tuple[Array, Array]:
@@ -476,7 +502,7 @@ def _own_sums(weigher: _Weigher, paths: Paths, sent: Array) -> Sums:
     groups = total - jnp.sum((count > 0).astype(total.dtype)) + 1.0
     none = jnp.zeros((1, 0), total.dtype)
     return Sums(
-        total[None], groups[None], weight[None], weight2[None], squares[None],
+        total[None], groups[None], weight[None], squares[None],
         none, none[..., None], none[..., None],
     )  # fmt: skip
 
@@ -501,18 +527,18 @@ def improve(paths: Paths, plan: Plan, asked: Layers, rays: int = PILOT) -> tuple
 @jax.jit
 def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> tuple[Array, Array]:
     weigher = _weigher(walked, asked, 1.0, shares, ended=True)
-    each = _walked(weigher, paths)
+    each = _under(paths, weigher.walked)
     largest = jnp.max(each, axis=1)
     density = jnp.exp(each - largest[:, None]) * jnp.sign(shares)[None]
     told_by = weigher.told
     assert told_by is not None
-    darker = jnp.exp(_under(paths, told_by.darker, told_by.ends) - largest[:, None])
-    wanted = _wanted(weigher, paths, largest)
+    darker = jnp.exp(_under(paths, told_by.darker) - largest[:, None])
+    wanted = _density(weigher, *_ready(weigher, paths, largest))
     sent = _of(paths.hero, len(shares), density.dtype)
     mean_of = sent / jnp.maximum(jnp.sum(sent, axis=0, keepdims=True), 1.0)
 
     def about_mean(x):
-        return x - product(sent, product(mean_of.T, x))
+        return x - product(mean_of.T, x)[paths.hero]
 
     def rest(now):
         """What each ray counts, and what its weights are off by, beyond what is known tells."""
@@ -542,7 +568,7 @@ def _improve(paths: Paths, walked: Layers, asked: Layers, shares: Array) -> tupl
         return new / jnp.sum(new), best, jnp.where(largest < least, largest, least)
 
     start = (shares, shares, jnp.asarray(jnp.inf, density.dtype))
-    return jax.lax.fori_loop(0, 12, better, start)[1:]
+    return jax.lax.fori_loop(0, 8, better, start)[1:]
 
 
 @partial(jax.jit, static_argnames=("bins", "own_only"))
