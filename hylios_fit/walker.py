@@ -59,7 +59,9 @@ MANY = 10  # particles in a pass through the strata, in the mean of the columns
 # steps among particles before each step that knows all else, and how many of those between two
 # exchanges of rays that ended
 STEPS, STEPS_AMONG_MANY = (0, 16), (3, 10)
-LANES, ACCELERATOR_LANES = 1024, 1 << 17
+# not a power of two on a CPU: the lanes' numbers would lie pages apart and push each other out of
+# its caches, which costs a tenth of a walk in light skin and a fifth in dark skin
+LANES, ACCELERATOR_LANES = 768, 1 << 17
 BATCH, ACCELERATOR_BATCH = 65_536, 1 << 19  # rays of one compiled call (`batch_rays`)
 
 
@@ -91,7 +93,7 @@ class _Medium(NamedTuple):
     fibre event of a pass. Tables by layer and column are flat."""
 
     thickness: Array  # (7,), or (7 k,) where specimens stand side by side
-    index: Array  # (8 k,): air, the layers, below
+    index: Array  # (8,), or (8 k,) where it differs among columns: air, the layers, below
     event: Array  # (7 k,): rate of particles, fibres or tissue
     absorb: Array  # (7 k,)
     albedo: Array  # (7 k,)
@@ -103,9 +105,11 @@ class _Medium(NamedTuple):
     one: Array  # 1, for `_keep`
 
 
-def _uniform(seeds: tuple[Array, Array], step: Array, draw: int, dtype: Any) -> Array:
-    """One of the `DRAWS` uniform numbers in (0, 1) of a step, for each ray."""
-    word = counter.word(seeds, step * jnp.uint32(DRAWS) + jnp.uint32(draw))
+def _uniform(seeds: tuple[Array, Array], step: Array, dtype: Any) -> Array:
+    """(draw, ray): the `DRAWS` uniform numbers in (0, 1) of a step, for each ray."""
+    draw = jnp.arange(DRAWS, dtype=jnp.uint32)[:, None]
+    start, increment = seeds
+    word = counter.word((start[None], increment[None]), step * jnp.uint32(DRAWS) + draw)
     if dtype == jnp.float32:
         # 23 bits below the 1 of a float in [1, 2), then the middle of each step
         one_to_two = jax.lax.bitcast_convert_type((word >> 9) | jnp.uint32(0x3F800000), dtype)
@@ -172,8 +176,10 @@ class _Lane(NamedTuple):
     phase: Array
     before: tuple[Array, ...]  # the particle met before: centre from here, size (0: none), axis
     place: tuple[Array, ...]  # x, y, where exits are recorded
-    lengths: tuple[Array, ...]  # in each of the seven layers
-    counts: tuple[Array, ...]  # hits and proposed in each stratum, fibres, tissue, bottom
+    lengths: Array  # (7, lane), in each of the seven layers
+    hits: Array  # (3, lane), in each stratum
+    proposed: Array  # (3, lane)
+    counts: tuple[Array, ...]  # fibres, tissue, bottom
     bent: Array  # sum of the angles of the hits
     lift: Array  # `LIFT`
     steered: tuple[Array, Array]  # `STEERED` and `MET`
@@ -183,6 +189,9 @@ def _medium(layers: Layers, form: str, absorb: float) -> _Medium:
     dtype = layers.mu_a.dtype
     k = layers.mu_a.shape[1]
     one = jnp.ones((1, k), dtype)
+    index = jnp.concatenate([one, layers.index, layers.index[-1:]])
+    if not np.ptp(np.asarray(layers.index), axis=1).any():
+        index = index[:, :1]
     event = layers.mu_particle + layers.mu_tissue
     event = event.at[4].set(layers.mu_fibre)
     if form == "dispersed":
@@ -195,7 +204,7 @@ def _medium(layers: Layers, form: str, absorb: float) -> _Medium:
 
     return _Medium(
         thickness=seven(layers.thickness, layers.thickness[4:5]),
-        index=jnp.concatenate([one, layers.index, layers.index[-1:]]).reshape(-1),
+        index=index.reshape(-1),
         event=seven(event, 0.0 * one),
         absorb=seven(absorb * layers.mu_a, absorb * layers.mu_a[4:5]),
         albedo=seven(layers.hit_albedo**absorb, one),
@@ -223,6 +232,12 @@ def _thickness(m: _Medium, layer: Array, hero: Array) -> Array:
     if m.thickness.shape[0] == 7:
         return _pick(m.thickness, layer)
     return _at(m.thickness, jnp.maximum(layer, 0) * (m.event.shape[0] // 7) + hero)
+
+
+def _index(m: _Medium, layer: Array, hero: Array) -> Array:
+    if m.index.shape[0] == 8:
+        return _pick(m.index, layer + 1)
+    return _at(m.index, (layer + 1) * (m.event.shape[0] // 7) + hero)
 
 
 def _at(table: Array, place: Array) -> Array:
@@ -319,7 +334,7 @@ def _near(m: _Medium, layer: Array, hero: Array) -> _Near:
 class _Event(NamedTuple):
     """What the way to the next event or interface comes to, up to the angle of a hit."""
 
-    draws: tuple[Array, ...]  # the step's uniform numbers
+    draws: Array  # (draw, lane): the step's uniform numbers
     distance: Array
     depth: Array
     crosses: Array  # comes to an interface
@@ -339,7 +354,7 @@ def _event(
     lane: _Lane, m: _Medium, near: _Near, moves: Array, theta_0: Array, step: Array, spheroid: bool
 ) -> _Event:
     dtype = lane.depth.dtype
-    draws = _keep(m, *(_uniform(lane.seeds, step, draw, dtype) for draw in range(DRAWS)))
+    (draws,) = _keep(m, _uniform(lane.seeds, step, dtype))
     u1, u2, u3, u4, u5, _, u7, u8, u9, u10, u11 = draws
     rate = near.event + near.absorb
     ahead = jnp.where(lane.u[2] > 0, near.thickness - lane.depth, lane.depth)
@@ -458,15 +473,18 @@ def _among(
     state: Any = jax.lax.fori_loop(0, steps, one, (lane, zero, zero, zero))
     lane, length, hits, proposed = state
 
-    def there(i: int, new: Array) -> Array:
-        return jnp.where(lane.layer == i, new, 0.0)
-
-    seen = [there(i, new) for new in (hits, proposed) for i in (1, 2, 3)]
-    counts = [old + new for old, new in zip(lane.counts[:6], seen, strict=True)]
     return lane._replace(
-        lengths=tuple(old + there(i, length) for i, old in enumerate(lane.lengths)),
-        counts=(*counts, *lane.counts[6:]),
+        lengths=_into(lane.lengths, 0, lane.layer, length),
+        hits=_into(lane.hits, 1, lane.layer, hits),
+        proposed=_into(lane.proposed, 1, lane.layer, proposed),
     )
+
+
+def _into(totals: Array, first: int, layer: Array, new: Array) -> Array:
+    """The totals (row, lane) of the layer `first` and those below it, with what is `new` in the
+    layer that each ray is in: one pass over all rows."""
+    row = jnp.arange(first, first + totals.shape[0], dtype=layer.dtype)[:, None]
+    return totals + jnp.where(layer[None] == row, new[None], 0.0)
 
 
 def _step(
@@ -482,7 +500,6 @@ def _step(
     """Move every ray to its next event or interface, and let that happen. Whether hits are looked
     at for how they steer: only where there are many."""
     dtype = lane.depth.dtype
-    columns = m.event.shape[0] // 7
     layer = lane.layer
     near = _near(m, layer, hero)
     event = _event(lane, m, near, lane.phase == FLYING, theta_0, step, spheroid)
@@ -506,9 +523,7 @@ def _step(
     down = u[2] > 0
     layer = jnp.where(layer == 6, 4, layer)
     beyond = jnp.where(down, layer + 1, layer - 1)
-    n1, n2 = _keep(
-        m, _at(m.index, (layer + 1) * columns + hero), _at(m.index, (beyond + 1) * columns + hero)
-    )
+    n1, n2 = _keep(m, _index(m, layer, hero), _index(m, beyond, hero))
     cos_s = _facet(m, u9)
     (cos_s,) = _keep(m, jnp.where(layer + beyond == -1, cos_s, 1.0))  # between -1 and 0: rough
     sin_s = jnp.sqrt(jnp.clip(1.0 - cos_s**2, 0.0, 1.0))
@@ -526,7 +541,7 @@ def _step(
     lost = here & bottom & (u3 >= kept)
     done = here & ((valid > 0) | bottom)
     passes = done & (passes > 0) & ~bottom
-    lift = _lift(u[2], fibre | tissue, u9, here & bottom & ~lost, lane.counts[8])
+    lift = _lift(u[2], fibre | tissue, u9, here & bottom & ~lost, lane.counts[2])
     sin_b = jnp.sqrt(u9)
     diffuse = (sin_b * c, sin_b * s, -scattering.cosine_polar(u9))
     u = tuple(
@@ -537,9 +552,7 @@ def _step(
     top = u[2] > 0
     depth = jnp.where(done, jnp.where(top, 0.0, _thickness(m, layer, hero)), depth)
 
-    happened = [hit & ~ends & (lane.layer == i) for i in (1, 2, 3)]
-    happened += [event.particle & (lane.layer == i) for i in (1, 2, 3)]
-    happened += [fibre, tissue, here & bottom]
+    happened = fibre, tissue, here & bottom
     over = lane.phase >= ABOVE
     by_medium = ABSORBED + jnp.where(lane.layer == 6, 4, lane.layer)
     end = jnp.where(event.absorbed, by_medium, jnp.where(lost, AT_BOTTOM, BY_HIT - 1 + lane.layer))
@@ -556,10 +569,9 @@ def _step(
         phase=jnp.where(over, lane.phase, phase),
         before=event.before,
         place=_moved(lane, event),
-        lengths=tuple(
-            total + jnp.where(lane.layer == i, distance, 0.0)
-            for i, total in enumerate(lane.lengths)
-        ),
+        lengths=_into(lane.lengths, 0, lane.layer, distance),
+        hits=_into(lane.hits, 1, lane.layer, _number(hit & ~ends, dtype)),
+        proposed=_into(lane.proposed, 1, lane.layer, _number(event.particle, dtype)),
         counts=tuple(
             total + _number(flag, dtype) for flag, total in zip(happened, lane.counts, strict=True)
         ),
@@ -621,8 +633,10 @@ def _start(
         phase=jnp.full(ray.shape, WAITING, jnp.int32),
         before=() if independent else (zero,) * (7 if spheroid else 4),
         place=(zero,) * (2 if exits else 0),
-        lengths=(zero,) * 7,
-        counts=(zero,) * 9,
+        lengths=jnp.zeros((7, *ray.shape), dtype),
+        hits=jnp.zeros((3, *ray.shape), dtype),
+        proposed=jnp.zeros((3, *ray.shape), dtype),
+        counts=(zero,) * 3,
         bent=zero,
         lift=zero,
         steered=(zero, zero),
@@ -633,10 +647,10 @@ def _sums(lane: _Lane) -> Array:
     """(lane, 21): what adds up along each path."""
     first, last = lane.lengths[:4], lane.lengths[5]
     unspent, spent = lane.lengths[4], lane.lengths[6]
-    hits, (fibre, tissue, bottom) = lane.counts[:6], lane.counts[6:]
-    straight = _number((sum(hits[:3]) > 0) & (lane.bent == 0), lane.bent.dtype)
+    fibre, tissue, bottom = lane.counts
+    straight = _number((jnp.sum(lane.hits, axis=0) > 0) & (lane.bent == 0), lane.bent.dtype)
     rows = (
-        *first, unspent + spent, last, *hits, fibre, unspent, tissue, bottom, lane.bent, straight,
+        *first, unspent + spent, last, *lane.hits, *lane.proposed, fibre, unspent, tissue, bottom, lane.bent, straight,
         lane.lift, *lane.steered,
     )  # fmt: skip
     return jnp.stack(rows, axis=1)
@@ -709,7 +723,9 @@ def _walk(
         place = jnp.where(ended, after, place).astype(jnp.int32)
         begins = ended & (place < sent)
         new = fresh(first + order[jnp.clip(place, 0, rays - 1)].astype(jnp.uint32))
-        lane = jax.tree.map(lambda n, o: jnp.where(begins, n, o), new, lane)
+        lane = jax.tree.map(
+            lambda n, o: jnp.where(jnp.broadcast_to(begins, n.shape), n, o), new, lane
+        )
         upcoming = upcoming + jnp.sum(ended, dtype=jnp.int32)
         return step, lane, place, sums, escaped, end, left, upcoming
 
