@@ -202,12 +202,12 @@ def _ready(weigher: _Weigher, paths: Paths, unit: Array) -> tuple[Array, Array |
     return jnp.concatenate([sums, -unit[:, None]], axis=1), angles
 
 
-def _density(weigher: _Weigher, exponent: Array, angles: Array | None) -> Array:
+def _density(weigher: _Weigher, exponent: Array, angles: Any) -> Array:
     """(ray, w): density of each path that came back."""
     one = jnp.ones((1, weigher.asked.shape[1]), weigher.asked.dtype)
     density = jnp.concatenate([weigher.asked[: exponent.shape[1] - 1], one])
     density = jnp.exp(product(exponent, density))
-    return density if angles is None else density * product(angles, weigher.nodes)
+    return density if weigher.nodes is None else density * product(angles, weigher.nodes)
 
 
 def _own_weights(weigher: _Weigher, paths: Paths) -> Array:
@@ -253,9 +253,9 @@ def _group(rays: int) -> int:
 
 
 class Sums(NamedTuple):
-    """Sums over the rays of each fold (f) and its groups: the rays and groups, the weights (w); what
-    is known of the paths (k, `_known`) beyond its mean; and products of the
-    sums of a group, over its rays. `add` those of lots that share a plan."""
+    """Sums over the rays of each fold (f) and its groups: the rays and groups, the weights (w), and
+    what is known of the paths (k, `_known`) beyond its mean; and products of the sums of a group,
+    over its rays. `add` those of lots that share a plan."""
 
     rays: Float[Array, "f"]
     groups: Float[Array, "f"]

@@ -334,7 +334,7 @@ def _near(m: _Medium, layer: Array, hero: Array) -> _Near:
 class _Event(NamedTuple):
     """What the way to the next event or interface comes to, up to the angle of a hit."""
 
-    draws: Array  # (draw, lane): the step's uniform numbers
+    draws: tuple[Array, ...]  # the step's uniform numbers
     distance: Array
     depth: Array
     crosses: Array  # comes to an interface
@@ -354,7 +354,7 @@ def _event(
     lane: _Lane, m: _Medium, near: _Near, moves: Array, theta_0: Array, step: Array, spheroid: bool
 ) -> _Event:
     dtype = lane.depth.dtype
-    (draws,) = _keep(m, _uniform(lane.seeds, step, dtype))
+    draws: tuple[Array, ...] = tuple(*_keep(m, _uniform(lane.seeds, step, dtype)))
     u1, u2, u3, u4, u5, _, u7, u8, u9, u10, u11 = draws
     rate = near.event + near.absorb
     ahead = jnp.where(lane.u[2] > 0, near.thickness - lane.depth, lane.depth)
@@ -650,8 +650,8 @@ def _sums(lane: _Lane) -> Array:
     fibre, tissue, bottom = lane.counts
     straight = _number((jnp.sum(lane.hits, axis=0) > 0) & (lane.bent == 0), lane.bent.dtype)
     rows = (
-        *first, unspent + spent, last, *lane.hits, *lane.proposed, fibre, unspent, tissue, bottom, lane.bent, straight,
-        lane.lift, *lane.steered,
+        *first, unspent + spent, last, *lane.hits, *lane.proposed, fibre, unspent, tissue, bottom,
+        lane.bent, straight, lane.lift, *lane.steered,
     )  # fmt: skip
     return jnp.stack(rows, axis=1)
 

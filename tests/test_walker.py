@@ -53,10 +53,8 @@ def numbers(first=0, step=0, draw=0, key=(1, 2), count=1 << 16, dtype=jnp.float3
     """Four draws of a step, of some rays."""
     ray = jnp.arange(count, dtype=jnp.uint32) + jnp.uint32(first)
     seeds = counter.seeds(ray, jnp.asarray(key, jnp.uint32))
-    return [
-        np.asarray(walker._uniform(seeds, jnp.uint32(step), draw + i, jnp.dtype(dtype)), float)
-        for i in range(4)
-    ]
+    every = walker._uniform(seeds, jnp.uint32(step), jnp.dtype(dtype))
+    return list(np.asarray(every[draw : draw + 4], float))
 
 
 def independent(x, y, bins=16):
@@ -94,9 +92,7 @@ def test_steps_of_one_ray_are_independent():
     for ray in (0, 7, 1 << 31):
         one = jnp.full(step.shape, ray, jnp.uint32)
         seeds = counter.seeds(one, jnp.asarray([1, 2], jnp.uint32))
-        x = np.asarray(
-            [walker._uniform(seeds, step, draw, jnp.dtype("float32")) for draw in range(4)]
-        )
+        x = np.asarray(walker._uniform(seeds, step[None], jnp.dtype("float32")))[:4]
         for i in range(4):
             assert independent(x[i, ::2], x[i, 1::2]) > 1e-5
             assert independent(x[i], x[(i + 1) % 4]) > 1e-5
@@ -106,9 +102,7 @@ def test_the_numbers_stay_inside_the_unit_interval():
     @jax.jit
     def ends(ray):
         seeds = counter.seeds(ray, jnp.asarray([1, 2], jnp.uint32))
-        x = jnp.stack(
-            [walker._uniform(seeds, jnp.uint32(0), i, jnp.dtype("float32")) for i in range(4)]
-        )
+        x = walker._uniform(seeds, jnp.uint32(0), jnp.dtype("float32"))[:4]
         return jnp.stack([jnp.min(x), jnp.max(x)])
 
     for start in range(0, 1 << 24, 1 << 22):
@@ -239,8 +233,8 @@ def test_slopes_are_those_of_the_solver_also_at_a_content_of_nothing():
 
     slope = jax.jit(jax.jacfwd(curve))
     x = jnp.asarray(S3.parameters(names), jnp.float32)
-    found = []
-    for i in range(8):
+    found, lots = [], 24  # rare paths tell of what is not there: few lots say little of the error
+    for i in range(lots):
         paths = walker.walk(
             plan.layers, "complex", jax.random.key(20 + i), rays=16_384, independent=True,
             shares=plan.shares,
@@ -249,12 +243,12 @@ def test_slopes_are_those_of_the_solver_also_at_a_content_of_nothing():
     _, exact = adding.slopes(S3, nm, names, independent=True)
     surface = np.asarray(adding.skin(layers).surface)
     exact = np.asarray(exact) / (1.0 - surface)
-    mean, error = np.mean(found, axis=0), np.std(found, axis=0, ddof=1) / math.sqrt(8)
+    mean, error = np.mean(found, axis=0), np.std(found, axis=0, ddof=1) / math.sqrt(lots)
     assert np.all(exact < 0)
     z = (mean - exact) / error
-    assert np.abs(z).max() < 6  # of Student's t with 7 degrees of freedom
+    assert np.abs(z).max() < 5
     # few of the paths meet what is not there, which makes its slope right and noisy
-    assert np.all(error[1:, :3] < 0.25 * np.abs(exact[1:, :3]))
+    assert np.all(error[1:, :3] < 0.15 * np.abs(exact[1:, :3]))
 
 
 # --- sharing, absorbing, repeating ---------------------------------------------------------------
@@ -273,8 +267,7 @@ def test_other_company_leaves_a_wavelength_the_same(found):
     two = tally.collect(walk(layers, jax.random.key(6)), layers, layers)
     common = np.array([0, 2])
     part = [
-        tally.Tally(t.rays, t.groups, t.weight[common], t.weight2[common], t.squares[common])
-        for t in (found, two)
+        tally.Tally(t.rays, t.groups, t.weight[common], t.squares[common]) for t in (found, two)
     ]
     within(*part)
 
@@ -373,8 +366,12 @@ def test_any_number_of_rays_can_be_summed(rays, paths, layers):
     found = tally.collect(some, layers, layers)
     weights = np.asarray(tally._weights(tally._weigher(layers, layers, 1.0, None), some), float)
     np.testing.assert_allclose(found.mean, weights.mean(axis=0), rtol=1e-4, atol=1e-7)
-    np.testing.assert_allclose(found.weight2, (weights**2).sum(axis=0), rtol=1e-4, atol=1e-7)
     group = -(-rays // int(found.groups))
+    if group == 1:
+        some = (weights**2).sum(axis=0)
+        effective = weights.sum(axis=0) ** 2 / np.maximum(some, 1e-30)
+        given = np.where(some > 0, found.effective_rays, 0.0)
+        np.testing.assert_allclose(given, effective, rtol=1e-3 + 1.0 / max(rays - 1, 1))
     sums = [weights[i : i + group].sum(axis=0) for i in range(0, rays, group)]
     counts = np.array([len(weights[i : i + group]) for i in range(0, rays, group)])
     assert len(sums) == int(found.groups)
@@ -611,7 +608,8 @@ def test_what_is_known_of_all_paths_is_so(name, form, bottom, independent):
         return
     # every way to end was met, and without what they are the sum is another
     assert np.all(np.bincount(np.asarray(paths.end), minlength=walker.ENDS)[[0, 1, 4, 5, 9, 10]])
-    bare = np.asarray(tally._mixed(weigher._replace(walked=weigher.walked[: walker.SUMS]), paths)[1], float) / shares
+    without = weigher._replace(walked=weigher.walked[: walker.SUMS])
+    bare = np.asarray(tally._mixed(without, paths)[1], float) / shares
     assert np.abs((bare.mean(axis=0) - 1.0) / error).max() > 6
 
 
@@ -661,7 +659,6 @@ def test_lots_are_steadied_by_what_all_of_them_tell(spectrum):
     apart = tally.tell(sums)
     assert apart.rays == at_once.rays
     assert apart.groups == at_once.groups
-    np.testing.assert_allclose(apart.weight2, at_once.weight2, rtol=1e-4)
     ratio = np.asarray(apart.standard_error) / np.asarray(at_once.standard_error)
     bright = np.asarray(at_once.mean) > 0.05
     assert np.abs(ratio[bright] - 1).max() < 0.05
