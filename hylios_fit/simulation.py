@@ -153,9 +153,7 @@ def _walked(
     more = rays if tolerance is None else FIRST
     if not few and not own_only:
         other, shares = jax.random.fold_in(key, 1), plan.shares
-        pilot = walk(
-            plan.layers, key=other, shares=shares, sent=tally.PILOT, leave=tally.PILOT_LEAVES
-        )
+        pilot = walk(plan.layers, key=other, shares=shares, sent=tally.PILOT)
         plan, variance = tally.improve(pilot, plan, medium)
         if tolerance is not None:
             # fewer say little of their own error, and steady each other not at all

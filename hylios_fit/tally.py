@@ -39,7 +39,7 @@ from hylios_fit.walker import (
 CHUNK, PIECE, LOOK, ACCELERATOR_CHUNK = 64, 32, 512, 8192
 GROUP = 64  # rays whose sum counts as one for the errors: columns take turns within it
 GROUPS = 256  # no fewer, or what they say of the errors is noise
-PILOT, PILOT_LEAVES = 4096, 40  # rays that `improve` looks at; how many may be on their way yet
+PILOT = 4096  # rays that `improve` looks at
 WATCHED = 160  # wavelengths whose errors shares are chosen by
 TINY = 1e-9  # and at least this, where no ray knows a column
 FOLDS = 8  # of the rays of a sum: what each takes off the others say
@@ -292,7 +292,8 @@ def _sums(
         return jnp.zeros(shape, dtype)
 
     group = _group(paths.hero.shape[0])
-    chunks = _chunks(paths, LOOK, group)
+    # with as many columns as wavelengths, what they need is no less
+    chunks = _chunks(paths, CHUNK if weigher.nodes is None else LOOK, group)
     size = chunks.hero.shape[1]
     cut = jax.default_backend() == "cpu" and size % PIECE == 0
     part_of_chunk, part_of_group = (PIECE, min(PIECE, group)) if cut else (size, group)

@@ -42,6 +42,25 @@ def side_by_side(function: Callable[[Item], Answer], items: Iterable[Item]) -> I
         yield from pool.map(one, items)
 
 
+def in_one_piece(function: Callable[[Any], Any], given: Any) -> Any:
+    """The function of what is given, where it is traced: on a CPU a program of one piece.
+
+    XLA makes a program for each step of a loop and shares them among its threads, which then wait
+    for each other: a walk of small steps takes two cores half as long again as one alone needs.
+    `xla_cpu_small_call` is what XLA itself marks loops with that it holds to be too small for that
+    (SmallWhileLoopHoisting). It holds no scatter, and must use all that it closes over. Only where
+    it was tried, jaxlib 0.9: XLA promises nothing of it.
+    """
+    import jax
+    import jaxlib.version
+    from jax.experimental.xla_metadata import set_xla_metadata
+
+    if jax.default_backend() != "cpu" or jaxlib.version.__version_info__[:2] != (0, 9):
+        return function(given)
+    found = jax.jit(function)(given)
+    return set_xla_metadata(found, xla_cpu_small_call="true", inlineable="false")
+
+
 def one_blas_thread() -> AbstractContextManager[Any]:
     """A context in which NumPy, SciPy and XLA on the CPU solve and multiply on one thread."""
     return _controller().limit(limits=1, user_api="blas")

@@ -36,6 +36,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from hylios_fit import counter, fresnel, melanosome, scattering
 from hylios_fit.skin import LAYERS, STRATA, Layers
+from hylios_fit.threads import in_one_piece
 
 # What is summed along a path, in this order
 LENGTH = slice(0, 6)  # path length in each layer, cm
@@ -59,9 +60,9 @@ MANY = 10  # particles in a pass through the strata, in the mean of the columns
 # steps among particles before each step that knows all else, and how many of those between two
 # exchanges of rays that ended
 STEPS, STEPS_AMONG_MANY = (0, 16), (3, 10)
-# not a power of two on a CPU: the lanes' numbers would lie pages apart and push each other out of
-# its caches, which costs a tenth of a walk in light skin and a fifth in dark skin
-LANES, ACCELERATOR_LANES = 768, 1 << 17
+# On a CPU their numbers stay in a core's cache; and no power of two from 1,024, or they lie pages
+# apart and push each other out of it.
+LANES, ACCELERATOR_LANES = 192, 1 << 17
 BATCH, ACCELERATOR_BATCH = 65_536, 1 << 19  # rays of one compiled call (`batch_rays`)
 
 
@@ -317,17 +318,17 @@ class _Near(NamedTuple):
     event: Array
     albedo: Array
     thickness: Array
-    size: Array  # of its particles
+    size: Array | None  # of its particles, where they have a place
 
 
-def _near(m: _Medium, layer: Array, hero: Array) -> _Near:
+def _near(m: _Medium, layer: Array, hero: Array, placed: bool) -> _Near:
     row = jnp.maximum(layer, 0) * (m.event.shape[0] // 7) + hero
     return _Near(
         _at(m.absorb, row),
         _at(m.event, row),
         _at(m.albedo, row),
         _thickness(m, layer, hero),
-        _pick(m.particle, layer - 1),
+        _pick(m.particle, layer - 1) if placed else None,
     )
 
 
@@ -378,6 +379,7 @@ def _event(
     p, q = _keep(m, *p), _keep(m, *q)
     before, hit = lane.before, particle
     if before:
+        assert near.size is not None
         moved = [b - distance * ui for b, ui in zip(before[:3], lane.u, strict=True)]
         before = (*_keep(m, *moved), *before[3:])
         make = _spheroid if spheroid else _sphere
@@ -462,7 +464,7 @@ def _among(
     spheroid: bool,
 ) -> _Lane:
     """So many of `_particle_step`, during which no ray changes its layer."""
-    near, worth = _near(m, lane.layer, hero), _worth(lane)
+    near, worth = _near(m, lane.layer, hero, bool(lane.before)), _worth(lane)
     zero = jnp.zeros_like(lane.depth)
 
     def one(i, state):
@@ -501,7 +503,7 @@ def _step(
     at for how they steer: only where there are many."""
     dtype = lane.depth.dtype
     layer = lane.layer
-    near = _near(m, layer, hero)
+    near = _near(m, layer, hero, bool(lane.before))
     event = _event(lane, m, near, lane.phase == FLYING, theta_0, step, spheroid)
     _, _, u3, _, u5, _, u7, u8, u9, u10, _ = event.draws
     crosses, distance, depth = event.crosses, event.distance, event.depth
@@ -678,7 +680,6 @@ def _walk(
     first: Array,
     sent: Array,
     incidence: Array,
-    leave: Array,
     rays: int,
     independent: bool,
     spheroid: bool,
@@ -708,7 +709,8 @@ def _walk(
                 step = step + jnp.uint32(among)
             return step, _step(lane, medium, hero, theta_0, step, spheroid, below, among > 0)
 
-        step, lane = jax.lax.fori_loop(0, round_length, one, (step, lane))
+        steps = partial(jax.lax.fori_loop, 0, round_length, one)
+        step, lane = in_one_piece(steps, (step, lane))
         ended = (lane.phase >= ABOVE) & (place < sent)
         # out-of-range places are dropped: each ray is written once, when it ends
         target = jnp.where(ended, ray, rays)
@@ -744,8 +746,7 @@ def _walk(
 
     def going_on(state):
         _, lane, place, *_, upcoming = state
-        on_their_way = jnp.sum((lane.phase < ABOVE) & (place < sent), dtype=jnp.int32)
-        return (upcoming < sent) | (on_their_way > leave)
+        return (upcoming < sent) | jnp.any((lane.phase < ABOVE) & (place < sent))
 
     state = jax.lax.while_loop(going_on, round_, state)
     _, _, _, sums, escaped, end, left, _ = state
@@ -765,7 +766,6 @@ def walk(
     heroes: np.ndarray | None = None,
     shares: Float[Array, "k"] | None = None,
     sent: int | None = None,
-    leave: int = 0,
 ) -> Paths:
     """Walk `rays` rays, number `first` and on, spread over the layers' columns.
 
@@ -774,12 +774,11 @@ def walk(
     overlap the one before or cross a boundary. `incidence` in radians. The same key and numbers
     (`first`, `rays`) give the same paths. `shares` of the rays for each column, by default
     `hero_shares`; or `heroes`, the column of each. Only the first `sent` of them set out, if given:
-    a pilot needs no program of its own. It may `leave` so many on their way, whose sums stay 0:
-    such paths can plan a walk, and give no answer.
+    a pilot needs no program of its own.
     """
     return _run(
         layers, form, key, incidence, first, rays, absorb, independent, heroes, shares, False,
-        LAYERS[-1], sent, leave,
+        LAYERS[-1], sent,
     )[0]  # fmt: skip
 
 
@@ -810,7 +809,7 @@ def walk_out(
 
 def _run(
     layers, form, key, incidence, first, rays, absorb, independent, heroes, shares, exits, last,
-    sent=None, leave=0,
+    sent=None,
 ) -> tuple[Paths, Array]:  # fmt: skip
     medium = _medium(layers, form, absorb)
     bits = jax.random.bits(key, (2,), jnp.uint32)
@@ -827,7 +826,6 @@ def _run(
         jnp.asarray(first, jnp.uint32),
         jnp.asarray(sent, jnp.int32),
         jnp.asarray(incidence, layers.mu_a.dtype),
-        jnp.asarray(leave, jnp.int32),
         rays,
         independent,
         form == "dispersed",

@@ -412,17 +412,6 @@ def test_of_a_pilot_the_first_rays_set_out(paths, layers):
     assert not np.asarray(few.escaped)[100:].any()
 
 
-def test_a_pilot_may_leave_its_longest_rays(layers):
-    whole = walk(layers, jax.random.key(1), sent=1000)
-    pilot = walk(layers, jax.random.key(1), sent=1000, leave=50)
-    left = ~np.asarray(pilot.sums)[:1000].any(axis=1)
-    assert 1 <= left.sum() <= 50
-    for part, other in zip(pilot, whole, strict=True):
-        np.testing.assert_array_equal(part[:1000][~left], other[:1000][~left])
-    longest = np.asarray(whole.sums)[:1000, walker.LENGTH].sum(axis=1)
-    assert longest[left].mean() > 2 * longest[~left].mean()
-
-
 @pytest.mark.parametrize("many", [walker.MANY, 0])
 def test_both_precisions_agree(found, monkeypatch, many):
     monkeypatch.setattr(walker, "MANY", many)
@@ -664,7 +653,7 @@ def test_lots_are_steadied_by_what_all_of_them_tell(spectrum):
     assert np.abs(ratio[bright] - 1).max() < 0.05
     # other folds, the same rays: much nearer than two walks are
     z = (np.asarray(apart.mean) - np.asarray(at_once.mean)) / np.asarray(at_once.standard_error)
-    assert np.abs(z[bright]).max() < 0.3
+    assert np.sqrt(np.mean(z[bright] ** 2)) < 0.2
 
 
 def test_slopes_are_of_what_the_columns_leave(spectrum):
