@@ -3,7 +3,7 @@
 Linear algebra is held to one thread: on the small matrices of this package threads gain nothing,
 and where cores are few or shared they wait for each other: a solve of 33 by 33 then takes a hundred
 times as long as it should. A program of many small steps, such as a walk, XLA cannot spread over
-cores (it keeps two busy for the work of one): several run side by side instead.
+cores: it is one piece (`in_one_piece`), and several run side by side.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One thread of linear algebra, in every library that has any."""
+"""One thread of linear algebra, in every library that has any; loops in one piece."""
 
 import os
 import subprocess
@@ -6,8 +6,10 @@ import sys
 
 import jax
 import jax.numpy as jnp
+import jaxlib.version
+import numpy as np
 
-from hylios_fit.threads import cores, side_by_side
+from hylios_fit.threads import cores, in_one_piece, side_by_side
 
 SCRIPT = """
 from hylios_fit.threads import one_blas_thread
@@ -40,3 +42,17 @@ def test_items_keep_their_order_and_the_callers_precision():
             found = list(side_by_side(lambda i: jnp.arange(3.0) + i, range(5)))
         assert [float(x[0]) for x in found] == [0.0, 1.0, 2.0, 3.0, 4.0]
         assert {x.dtype for x in found} == {jnp.dtype(dtype)}
+
+
+def test_a_loop_in_one_piece_gives_what_it_gives_in_many():
+    scale = jnp.linspace(1.0, 2.0, 100)
+
+    def steps(x):
+        return jax.lax.fori_loop(0, 5, lambda i, y: (jnp.sin(scale * y[0]) + 1.0, y[1]), x)
+
+    x = jnp.linspace(0.0, 1.0, 100), jnp.ones(3)
+    many, one = jax.jit(steps), jax.jit(lambda x: in_one_piece(steps, x))
+    for found, expected in zip(one(x), many(x), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+    tried = jax.default_backend() == "cpu" and jaxlib.version.__version_info__[:2] == (0, 9)
+    assert ("xla_cpu_small_call" in one.lower(x).compile().as_text()) == tried
