@@ -35,7 +35,8 @@ from hylios_fit.walker import (
     node_shares,
 )
 
-# rays at a time, so that memory does not depend on their number; by all wavelengths, and otherwise
+# Rays at a time, so that memory does not depend on their number: with a number for every wavelength
+# (fewer where only sums of groups are kept: they stay in the cache), and for every column of a plan
 CHUNK, PIECE, LOOK, ACCELERATOR_CHUNK = 64, 32, 512, 8192
 GROUP = 64  # rays whose sum counts as one for the errors: columns take turns within it
 GROUPS = 256  # no fewer, or what they say of the errors is noise
