@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from functools import lru_cache
+from importlib.metadata import version
 from typing import Any, TypeVar
 
 Item = TypeVar("Item")
@@ -52,11 +53,11 @@ def in_one_piece(function: Callable[[Any], Any], given: Any) -> Any:
     it was tried, jaxlib 0.9: XLA promises nothing of it.
     """
     import jax
-    import jaxlib.version
+
+    if jax.default_backend() != "cpu" or not version("jaxlib").startswith("0.9."):
+        return function(given)
     from jax.experimental.xla_metadata import set_xla_metadata
 
-    if jax.default_backend() != "cpu" or jaxlib.version.__version_info__[:2] != (0, 9):
-        return function(given)
     found = jax.jit(function)(given)
     return set_xla_metadata(found, xla_cpu_small_call="true", inlineable="false")
 
