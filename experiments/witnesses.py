@@ -132,12 +132,12 @@ def _one(number: int, seed: int) -> dict[str, Any]:
         solution = adding.skin(medium, order=ORDER)
         surface = np.asarray(solution.surface, float)
         exact[kind] = np.asarray(solution.reflectance, float)
-        mean, unscaled, total, own = _walked(specimen, layers, key, independent)
+        mean, covariance, total, own = _walked(specimen, layers, key, independent)
         inside = np.asarray(solution.subsurface, float)
         difference = (1 - surface) * mean - inside
-        covariance = unscaled * np.outer(1 - surface, 1 - surface)
+        covariance = covariance * np.outer(1 - surface, 1 - surface)
         error = np.sqrt(np.diag(covariance))
-        effective = tally.effective_rays(mean, np.sqrt(np.diag(unscaled)), RAYS)
+        effective = tally.effective_rays((1 - surface) * mean, error, RAYS)
         enough = (effective > ENOUGH) & (error > 0)
         # wavelengths that share nearly all paths are one comparison, not two
         size, vectors = np.linalg.eigh(covariance[np.ix_(enough, enough)])

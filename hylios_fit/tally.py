@@ -35,9 +35,8 @@ from hylios_fit.walker import (
     node_shares,
 )
 
-# Rays at a time, so that memory does not depend on their number: with a number for every wavelength
-# (fewer where only sums of groups are kept: they stay in the cache), and for every column of a plan
-CHUNK, PIECE, LOOK, ACCELERATOR_CHUNK = 64, 32, 512, 8192
+CHUNK, ACCELERATOR_CHUNK = 64, 8192  # rays at a time: memory does not depend on their number
+PIECE = 32  # of a chunk on a CPU, whose weights at all wavelengths stay in the cache
 GROUP = 64  # rays whose sum counts as one for the errors: columns take turns within it
 GROUPS = 256  # no fewer, or what they say of the errors is noise
 PILOT = 4096  # rays that `improve` looks at
@@ -231,11 +230,11 @@ def _sum_own_weights(weigher: _Weigher, paths: Paths, columns: int) -> tuple[Arr
     return total[:, 0], total[:, 1]
 
 
-def _chunks(paths: Paths, most: int = CHUNK, group: int = 1) -> Paths:
-    """The rays by `most` or `ACCELERATOR_CHUNK`, whole groups; what fills the last one never came
+def _chunks(paths: Paths, group: int = 1) -> Paths:
+    """The rays by `CHUNK` or `ACCELERATOR_CHUNK`, whole groups; what fills the last one never came
     out."""
     rays = paths.hero.shape[0]
-    most = most if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK
+    most = CHUNK if jax.default_backend() == "cpu" else ACCELERATOR_CHUNK
     size = min(most, rays + -rays % group)
     padding = -rays % size
     return Paths(
@@ -293,11 +292,10 @@ def _sums(
         return jnp.zeros(shape, dtype)
 
     group = _group(paths.hero.shape[0])
-    # with as many columns as wavelengths, what they need is no less
-    chunks = _chunks(paths, CHUNK if weigher.nodes is None else LOOK, group)
+    chunks = _chunks(paths, group)
     size = chunks.hero.shape[1]
-    cut = jax.default_backend() == "cpu" and size % PIECE == 0
-    part_of_chunk, part_of_group = (PIECE, min(PIECE, group)) if cut else (size, group)
+    cut = PIECE if size == CHUNK else size
+    within = min(group, cut)  # of a group in a piece
     folds, known, told = 1, 0, weigher.told
     both = weigher.walked
     if told is not None:
@@ -308,8 +306,8 @@ def _sums(
     # what did not set out is not looked at
     used = (sent + size - 1) // size
 
-    def grouped(x):
-        return jnp.sum(x.reshape(-1, group, *x.shape[1:]), axis=1)
+    def grouped(x, many=group):
+        return jnp.sum(x.reshape(-1, many, *x.shape[1:]), axis=1)
 
     def look(i):
         """A chunk; the logarithm of its densities; of each group, how many set out and (k) what
@@ -366,11 +364,11 @@ def _sums(
             weight = _density(weigher, exponent, angles)
             if by_sum is not None:
                 by_sum = by_sum + product(sums[0].T, weight)
-            return by_sum, jnp.sum(weight.reshape(-1, part_of_group, width), axis=1)
+            return by_sum, grouped(weight, within)
 
-        pieces = jax.tree.map(lambda x: x.reshape(-1, part_of_chunk, *x.shape[1:]), some)
+        pieces = jax.tree.map(lambda x: x.reshape(-1, cut, *x.shape[1:]), some)
         by_sum, w = jax.lax.scan(piece, by_sum, pieces)
-        w = jnp.sum(w.reshape(size // group, -1, width), axis=1)
+        w = grouped(w.reshape(-1, width), group // within)
         rays, beyond, beyond2 = known_so_far((carry.rays, carry.beyond, carry.beyond2), count, c)
         found = Sums(
             rays,

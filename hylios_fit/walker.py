@@ -191,7 +191,7 @@ def _medium(layers: Layers, form: str, absorb: float) -> _Medium:
     k = layers.mu_a.shape[1]
     one = jnp.ones((1, k), dtype)
     index = jnp.concatenate([one, layers.index, layers.index[-1:]])
-    if not np.ptp(np.asarray(layers.index), axis=1).any():
+    if not _disperses(layers):
         index = index[:, :1]
     event = layers.mu_particle + layers.mu_tissue
     event = event.at[4].set(layers.mu_fibre)
@@ -218,6 +218,10 @@ def _medium(layers: Layers, form: str, absorb: float) -> _Medium:
     )
 
 
+def _disperses(layers: Layers) -> bool:
+    return bool(np.ptp(np.asarray(layers.index), axis=1).any())
+
+
 _facets = lru_cache(maxsize=32)(fresnel.facet_table)
 
 
@@ -229,16 +233,19 @@ def _pick(table: Array, layer: Array) -> Array:
     return out
 
 
+def _of_layer(m: _Medium, table: Array, rows: int, layer: Array, hero: Array) -> Array:
+    """From a table by layer alone, or by layer and column."""
+    if table.shape[0] == rows:
+        return _pick(table, layer)
+    return _at(table, jnp.maximum(layer, 0) * (m.event.shape[0] // 7) + hero)
+
+
 def _thickness(m: _Medium, layer: Array, hero: Array) -> Array:
-    if m.thickness.shape[0] == 7:
-        return _pick(m.thickness, layer)
-    return _at(m.thickness, jnp.maximum(layer, 0) * (m.event.shape[0] // 7) + hero)
+    return _of_layer(m, m.thickness, 7, layer, hero)
 
 
 def _index(m: _Medium, layer: Array, hero: Array) -> Array:
-    if m.index.shape[0] == 8:
-        return _pick(m.index, layer + 1)
-    return _at(m.index, (layer + 1) * (m.event.shape[0] // 7) + hero)
+    return _of_layer(m, m.index, 8, layer + 1, hero)
 
 
 def _at(table: Array, place: Array) -> Array:
@@ -355,7 +362,8 @@ def _event(
     lane: _Lane, m: _Medium, near: _Near, moves: Array, theta_0: Array, step: Array, spheroid: bool
 ) -> _Event:
     dtype = lane.depth.dtype
-    draws: tuple[Array, ...] = tuple(*_keep(m, _uniform(lane.seeds, step, dtype)))
+    (every,) = _keep(m, _uniform(lane.seeds, step, dtype))
+    draws: tuple[Array, ...] = tuple(every)
     u1, u2, u3, u4, u5, _, u7, u8, u9, u10, u11 = draws
     rate = near.event + near.absorb
     ahead = jnp.where(lane.u[2] > 0, near.thickness - lane.depth, lane.depth)
@@ -1021,7 +1029,7 @@ def own_plan(layers: Layers, absorb: float) -> Plan:
 def plan_or_own(layers: Layers, absorb: float) -> tuple[Plan, bool]:
     """`plan`; or `own_plan`, and True, where the refractive index depends on the wavelength and
     bends every path its own way."""
-    if np.ptp(np.asarray(layers.index), axis=1).any():
+    if _disperses(layers):
         return own_plan(layers, absorb), True
     return plan(layers), False
 

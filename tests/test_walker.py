@@ -371,7 +371,8 @@ def test_any_number_of_rays_can_be_summed(rays, paths, layers):
         some = (weights**2).sum(axis=0)
         effective = weights.sum(axis=0) ** 2 / np.maximum(some, 1e-30)
         given = np.where(some > 0, found.effective_rays, 0.0)
-        np.testing.assert_allclose(given, effective, rtol=1e-3 + 1.0 / max(rays - 1, 1))
+        rtol = 1e-3 + (1.0 / (rays - 1) if rays > 1 else 0.0)  # the error is of rays - 1
+        np.testing.assert_allclose(given, effective, rtol=rtol)
     sums = [weights[i : i + group].sum(axis=0) for i in range(0, rays, group)]
     counts = np.array([len(weights[i : i + group]) for i in range(0, rays, group)])
     assert len(sums) == int(found.groups)
@@ -629,11 +630,12 @@ def test_what_is_known_makes_errors_smaller_and_changes_no_mean(spectrum):
 
 def test_lots_are_steadied_by_what_all_of_them_tell(spectrum):
     plan = walker.plan(spectrum)
-    paths = several(plan, jax.random.key(26))
+    paths = several(plan, jax.random.key(26), lots=8)
     many = paths.hero.shape[0]
     assert many - many // tally.FOLDS >= tally.ENOUGH
     at_once = tally.collect(paths, plan.layers, spectrum, shares=plan.shares)
-    told = tally.tell(tally.gather(paths, plan.layers, spectrum, shares=plan.shares))
+    whole = tally.gather(paths, plan.layers, spectrum, shares=plan.shares)
+    told = tally.tell(whole)
     for one, two in zip(at_once, told, strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-5)
     sums = None
@@ -648,12 +650,14 @@ def test_lots_are_steadied_by_what_all_of_them_tell(spectrum):
     apart = tally.tell(sums)
     assert apart.rays == at_once.rays
     assert apart.groups == at_once.groups
+    for one, two in ((sums.weight, whole.weight), (sums.squares, whole.squares)):
+        np.testing.assert_allclose(one.sum(axis=0), two.sum(axis=0), rtol=1e-4)
     ratio = np.asarray(apart.standard_error) / np.asarray(at_once.standard_error)
     bright = np.asarray(at_once.mean) > 0.05
     assert np.abs(ratio[bright] - 1).max() < 0.05
     # other folds, the same rays: much nearer than two walks are
     z = (np.asarray(apart.mean) - np.asarray(at_once.mean)) / np.asarray(at_once.standard_error)
-    assert np.sqrt(np.mean(z[bright] ** 2)) < 0.2
+    assert np.abs(z[bright]).max() < 0.3
 
 
 def test_slopes_are_of_what_the_columns_leave(spectrum):
