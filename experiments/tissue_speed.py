@@ -38,7 +38,7 @@ SOURCES = {
 }
 C_SHARE = 8  # of the rays that the walk sends go through the C programs
 REPEATS = 7
-LANES = (256, 1024, 4096, 16384)
+LANES = (128, 1024, 4096, 16384)
 FEW = 100_000  # rays of the run that shows what the last ones cost
 
 
@@ -159,8 +159,8 @@ def _changes(key: jax.Array, repeats: int, thinner: int) -> dict[str, float]:
     for lanes in LANES:
         found[f"{lanes} lanes"] = rate(lanes=lanes)
     found[f"{FEW:,} rays"] = rate(min(FEW, rays))
-    with _replaced("NARROW", tissue.LANES):
-        found[f"{FEW:,} rays, all lanes to the end"] = rate(min(FEW, rays))
+    with _replaced("in_one_piece", lambda steps, given: steps(given)):
+        found["in many pieces"] = rate()
     tissue._walk.clear_cache()
     return found
 

@@ -28,6 +28,7 @@ from jaxtyping import Array, Float, Int, Key
 from hylios_fit import fresnel
 from hylios_fit.counter import pcg4d
 from hylios_fit.errors import HyliosError
+from hylios_fit.threads import in_one_piece, side_by_side
 
 _RANGES = {  # lower, upper, whether the ends belong, what it is called in an error
     "thickness": (0.0, math.inf, False, "above 0 cm"),
@@ -191,9 +192,9 @@ def henyey_greenstein_bend(xi: Float[Array, "..."], g: Array) -> Float[Array, ".
     return 2.0 * a**2 * xi * (1.0 + g * rest) / (a + 2.0 * g * rest) ** 2
 
 
-LANES = 4096  # whose state stays in a core's cache
+LANES = 512  # whose state stays near a core
 ACCELERATOR_LANES = 1 << 19
-NARROW = 512  # lanes for the last rays, which would leave most of `LANES` idle
+LOT = 1024  # rays of a lane at most, so that no count comes near 32 bits; lots run side by side
 ROUND = 64  # steps between two looks at how many rays are left
 IDLE = -math.inf
 SINE = [(-1) ** n * math.pi ** (2 * n + 1) / math.factorial(2 * n + 1) for n in range(6)]
@@ -334,38 +335,42 @@ def _walk(stack: _Stack, key: Array, rays: Array, lanes: int) -> tuple[Array, Ar
     )
 
     def round_(carry):
-        step, s = carry
-
         def one(_, carry):
             step, s = carry
             return step + 1, _step(s, stack, step, key)
 
-        return jax.lax.fori_loop(0, ROUND, one, (step, _share_out(s)))
+        step, s = carry
+        return in_one_piece(
+            lambda carry: jax.lax.fori_loop(0, ROUND, one, carry), (step, _share_out(s))
+        )
 
     def busy(s):
         return (s.depth >= 0) | (s.left > 0)
 
-    narrow = min(NARROW, lanes)
-    # more than `narrow` at work, or rays left that more lanes than that could start
-    carry = jax.lax.while_loop(
-        lambda c: (
-            jnp.sum(c[1].depth >= 0, dtype=jnp.int32) + jnp.sum(c[1].left, dtype=jnp.int32) > narrow
-        ),
-        round_,
-        (jnp.zeros((), jnp.uint32), state),
-    )
-    step, wide = carry
-    ends_wide = jnp.stack(wide.ends)
-    chosen = jnp.argsort(~busy(wide))[:narrow]
-    state = jax.tree.map(lambda a: a[chosen], wide)
-    state = state._replace(
-        left=jnp.zeros(narrow, jnp.int32).at[0].set(jnp.sum(wide.left, dtype=jnp.int32)),
-        ends=tuple(jnp.zeros(narrow, jnp.int32) for _ in range(ends)),
-        interactions=jnp.zeros(narrow, jnp.uint32),
-    )
-    _, state = jax.lax.while_loop(lambda c: jnp.any(busy(c[1])), round_, (step, state))
-    counts = jnp.concatenate([ends_wide, jnp.stack(state.ends)], axis=1)
-    return counts, jnp.concatenate([wide.interactions, state.interactions])
+    carry, counted = (jnp.zeros((), jnp.uint32), state), []
+    if lanes > LANES:  # the last rays would leave most lanes idle: so few go on in few
+        # more than `LANES` at work, or rays left that more lanes than that could start
+        step, wide = jax.lax.while_loop(
+            lambda c: (
+                jnp.sum(c[1].depth >= 0, dtype=jnp.int32) + jnp.sum(c[1].left, dtype=jnp.int32)
+                > LANES
+            ),
+            round_,
+            carry,
+        )
+        counted.append((jnp.stack(wide.ends), wide.interactions))
+        chosen = jnp.argsort(~busy(wide))[:LANES]
+        none = jnp.zeros(LANES, jnp.int32)
+        few = jax.tree.map(lambda a: a[chosen], wide)._replace(
+            left=none.at[0].set(jnp.sum(wide.left, dtype=jnp.int32)),
+            ends=(none,) * ends,
+            interactions=none.astype(jnp.uint32),
+        )
+        carry = step, few
+    _, last = jax.lax.while_loop(lambda c: jnp.any(busy(c[1])), round_, carry)
+    counted.append((jnp.stack(last.ends), last.interactions))
+    how, interactions = zip(*counted, strict=True)
+    return jnp.concatenate(how, axis=-1), jnp.concatenate(interactions)
 
 
 def _stack(tissue: Tissue, incidence: float, dtype: Any) -> _Stack:
@@ -434,11 +439,18 @@ def walk(
         specular = float(fresnel.reflectance(jnp.cos(incidence), jnp.asarray(n1), jnp.asarray(n2)))
     if lanes is None:
         lanes = LANES if jax.default_backend() == "cpu" else ACCELERATOR_LANES
-    bits = jax.random.bits(key, (2,), jnp.uint32)
+    rays = int(rays)
+    lots = -(-rays // (LOT * lanes))
+    bits = jax.random.bits(key, (lots, 2), jnp.uint32)
     stack = _stack(tissue, incidence, dtype)
-    counts, interactions = _walk(stack, bits, jnp.asarray(rays, jnp.int32), lanes)
-    return Totals(
-        specular,
-        np.asarray(counts).sum(axis=1, dtype=np.int64),
-        int(np.asarray(interactions).sum(dtype=np.int64)),
-    )
+
+    def one(lot: int) -> tuple[Array, Array]:
+        share = rays // lots + (lot < rays % lots)
+        return _walk(stack, bits[lot], jnp.asarray(share, jnp.int32), lanes)
+
+    counts = np.zeros(ends, np.int64)
+    interactions = 0
+    for ended, met in side_by_side(one, range(lots)):
+        counts += np.asarray(ended).sum(axis=1, dtype=np.int64)
+        interactions += int(np.asarray(met).sum(dtype=np.int64))
+    return Totals(specular, counts, interactions)
