@@ -41,6 +41,7 @@ from hylios_fit.precision import HIGHEST
 from hylios_fit.skin import LAYERS, Layers, Specimen, let_stand
 from hylios_fit.skin import layers as layers_of
 from hylios_fit.streams import SAME, Streams
+from hylios_fit.threads import cores, side_by_side
 from hylios_fit.tissue import Tissue
 
 ORDER = 8
@@ -370,6 +371,37 @@ def _solve(c: Coefficients, optics: Optics, which: Array, kinds, counts, more: s
     return jax.tree.map(whole, jax.lax.map(one, (wide, blocks(which, 0))))
 
 
+def _spread(c: Coefficients, optics: Optics, which: Array, kinds, counts, more: str = ""):
+    """`_solve`, on a CPU by parts of the wavelengths side by side, a core each.
+
+    XLA spreads single products over threads, which then wait for each other for longer than a
+    product takes. Inside a transformation of JAX there are no parts.
+    """
+    w = which.size
+    blocks = -(-w // BLOCK)
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((c, which)))
+    if traced or blocks == 1 or jax.default_backend() != "cpu":
+        return _solve(c, optics, which, kinds, counts, more)
+    size = -(-blocks // cores()) * BLOCK
+    c, which = jax.tree.map(np.asarray, (c, which))
+
+    def part(start: int):
+        at = np.minimum(np.arange(start, start + size), w - 1)  # one shape, compiled once
+        some = Coefficients(
+            thickness=c.thickness[:, at],
+            extinction=c.extinction[:, at],
+            scattering=c.scattering[:, at],
+            once=c.once[:, at],
+            moments=tuple(None if a is None else a[at] for a in c.moments),
+            bottom=c.bottom[at],
+        )
+        with _precision(c.extinction.dtype):
+            return _solve(some, optics, which[at], kinds, counts, more)
+
+    found = side_by_side(part, range(0, w, size))
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts, -1)[..., :w], *found)
+
+
 def _of(matrix: Array, vector: Array) -> Array:
     return (matrix @ vector[..., None])[..., 0]
 
@@ -681,7 +713,7 @@ def _run(c, kinds, index, outside, roughness, incidence, order, dtype, inner, pa
         )
         entered = 1.0 - at
         absorbed = bottom = None
-        found = _solve(c, optics, which, kinds, counts, "inner" if inner else "")
+        found = _spread(c, optics, which, kinds, counts, "inner" if inner else "")
         if inner:
             found, absorbed, bottom = found
             absorbed, bottom = entered[None] * absorbed, entered * bottom
@@ -822,7 +854,7 @@ def slopes(
         c, optics, which, counts, at = _ready(
             c, kinds, index, 1.0, roughness, incidence, order, dtype
         )
-        out, by = _solve(c, optics, which, kinds, counts, "slopes")
+        out, by = _spread(c, optics, which, kinds, counts, "slopes")
         by_part = {
             "thickness": by.thickness,
             "mu_a": by.extinction,

@@ -321,6 +321,21 @@ def test_dispersion_is_solved_as_each_wavelength_alone(x64):
     np.testing.assert_allclose(together[[0, 11]], np.concatenate(alone), atol=2e-5)
 
 
+def test_the_parts_that_cores_solve_are_the_whole(x64, monkeypatch):
+    nm = np.linspace(300.0, 2400.0, 70)
+    layers = Specimen.preset("S3").replace(index_dispersion=0.02).layers(nm)
+
+    def found(block, used):
+        monkeypatch.setattr(adding, "BLOCK", block)
+        monkeypatch.setattr(adding, "cores", lambda: used)
+        return adding.skin(layers, order=4, inner=True)
+
+    whole = found(70, 1)
+    for used in (2, 8):  # three blocks: 2 and 1, and a core for each
+        for part, expected in zip(found(32, used), whole, strict=True):
+            np.testing.assert_allclose(part, expected, rtol=1e-11, atol=1e-14)
+
+
 def test_reticular_scattering_and_bottom(x64):
     pale = Specimen.preset("S3")
     dull = pale.replace(bottom_reflectance=0.2)
