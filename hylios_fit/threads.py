@@ -50,7 +50,7 @@ def in_one_piece(function: Callable[[Any], Any], given: Any) -> Any:
     for each other: a walk of small steps takes two cores half as long again as one alone needs.
     `xla_cpu_small_call` is what XLA itself marks loops with that it holds to be too small for that
     (SmallWhileLoopHoisting). It holds no scatter, and must use all that it closes over. Only for
-    jaxlib 0.9: XLA promises nothing of it, and 0.12 is as fast without.
+    jaxlib 0.9: XLA promises nothing of it, and that of 0.12 marks such loops itself.
     """
     import jax
 

@@ -54,5 +54,5 @@ def test_a_loop_in_one_piece_gives_what_it_gives_in_many():
     many, one = jax.jit(steps), jax.jit(lambda x: in_one_piece(steps, x))
     for found, expected in zip(one(x), many(x), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-6)
-    marked = jax.default_backend() == "cpu" and version("jaxlib").startswith("0.9.")
-    assert ("xla_cpu_small_call" in str(one.lower(x).compile().as_text())) == marked
+    if jax.default_backend() == "cpu" and version("jaxlib").startswith("0.9."):
+        assert "xla_cpu_small_call" in str(one.lower(x).compile().as_text())
