@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -62,6 +62,12 @@ class Coefficients(NamedTuple):
     once: Float[Array, "m w"]  # 1/cm, Rayleigh scattering that happens once a pass
     moments: tuple[Float[Array, "w l"] | None, ...]  # Legendre moments of the law, by layer
     bottom: Float[Array, "w"]  # reflectance of the diffusing bottom
+
+    def each(self, change: Callable[[Any, int], Any]) -> Coefficients:
+        """`change` of every array and its axis of wavelengths."""
+        by_layer = (change(a, 1) for a in self[:4])
+        moments = tuple(None if a is None else change(a, 0) for a in self.moments)
+        return Coefficients(*by_layer, moments=moments, bottom=change(self.bottom, 0))
 
 
 class Optics(NamedTuple):
@@ -352,15 +358,6 @@ def _solve(c: Coefficients, optics: Optics, which: Array, kinds, counts, more: s
         shape = (*a.shape[:axis], -1, size, *a.shape[axis + 1 :])
         return jnp.moveaxis(a.reshape(shape), axis, 0)
 
-    wide = Coefficients(
-        thickness=blocks(c.thickness, 1),
-        extinction=blocks(c.extinction, 1),
-        scattering=blocks(c.scattering, 1),
-        once=blocks(c.once, 1),
-        moments=tuple(None if a is None else blocks(a, 0) for a in c.moments),
-        bottom=blocks(c.bottom, 0),
-    )
-
     def one(block):
         return _solve_block(block[0], optics, block[1], kinds, counts, more)
 
@@ -368,7 +365,7 @@ def _solve(c: Coefficients, optics: Optics, which: Array, kinds, counts, more: s
         a = jnp.moveaxis(a, 0, -2)
         return a.reshape(*a.shape[:-2], -1)[..., :w]
 
-    return jax.tree.map(whole, jax.lax.map(one, (wide, blocks(which, 0))))
+    return jax.tree.map(whole, jax.lax.map(one, (c.each(blocks), blocks(which, 0))))
 
 
 def _spread(c: Coefficients, optics: Optics, which: Array, kinds, counts, more: str = ""):
@@ -387,16 +384,8 @@ def _spread(c: Coefficients, optics: Optics, which: Array, kinds, counts, more: 
 
     def part(start: int):
         at = np.minimum(np.arange(start, start + size), w - 1)  # one shape, compiled once
-        some = Coefficients(
-            thickness=c.thickness[:, at],
-            extinction=c.extinction[:, at],
-            scattering=c.scattering[:, at],
-            once=c.once[:, at],
-            moments=tuple(None if a is None else a[at] for a in c.moments),
-            bottom=c.bottom[at],
-        )
-        with _precision(c.extinction.dtype):
-            return _solve(some, optics, which[at], kinds, counts, more)
+        some = c.each(lambda a, axis: a.take(at, axis))
+        return _solve(some, optics, which[at], kinds, counts, more)
 
     found = side_by_side(part, range(0, w, size))
     return jax.tree.map(lambda *parts: jnp.concatenate(parts, -1)[..., :w], *found)

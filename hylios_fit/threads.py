@@ -29,14 +29,19 @@ def cores() -> int:
 
 def side_by_side(function: Callable[[Item], Answer], items: Iterable[Item]) -> Iterator[Answer]:
     """The function of each item, in their order, as many at once as there are cores; in the
-    precision and on the device that the caller set."""
+    precision, also of products, and on the device that the caller set."""
     import jax
 
     config: Any = jax.config
     wide, device = config.jax_enable_x64, config.jax_default_device
+    products = config.jax_default_matmul_precision
 
     def one(item: Item) -> Answer:
-        with jax.enable_x64(wide), jax.default_device(device):
+        with (
+            jax.enable_x64(wide),
+            jax.default_device(device),
+            jax.default_matmul_precision(products),
+        ):
             return jax.block_until_ready(function(item))
 
     with ThreadPoolExecutor(cores()) as pool:

@@ -340,9 +340,8 @@ def _walk(stack: _Stack, key: Array, rays: Array, lanes: int) -> tuple[Array, Ar
             return step + 1, _step(s, stack, step, key)
 
         step, s = carry
-        return in_one_piece(
-            lambda carry: jax.lax.fori_loop(0, ROUND, one, carry), (step, _share_out(s))
-        )
+        steps = partial(jax.lax.fori_loop, 0, ROUND, one)
+        return in_one_piece(steps, (step, _share_out(s)))
 
     def busy(s):
         return (s.depth >= 0) | (s.left > 0)

@@ -42,6 +42,10 @@ def test_items_keep_their_order_and_the_callers_precision():
             found = list(side_by_side(lambda i: jnp.arange(3.0) + i, range(5)))
         assert [float(x[0]) for x in found] == [0.0, 1.0, 2.0, 3.0, 4.0]
         assert {x.dtype for x in found} == {jnp.dtype(dtype)}
+    for products in (None, "highest"):
+        with jax.default_matmul_precision(products):
+            found = list(side_by_side(lambda _: jax.config.jax_default_matmul_precision, range(2)))
+        assert found == [products] * 2
 
 
 def test_a_loop_in_one_piece_gives_what_it_gives_in_many():

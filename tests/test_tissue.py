@@ -135,7 +135,11 @@ def test_a_literal_walk_in_three_dimensions_agrees(key, incidence):
 # more lanes than `LANES` end in as few; more rays than `LOT` a lane go in lots
 @pytest.mark.parametrize(
     ("rays", "lanes"),
-    [(1, None), (511, None), (513, None), (20_000, None), (4097, 4096), (513, 600), (20_001, 9)],
+    [
+        *((rays, None) for rays in (1, 511, 512, 513, 4095, 4097, 20_000)),
+        *((rays, 4096) for rays in (1, 511, 512, 513, 4095, 4097, 20_000)),
+        (20_001, 9),
+    ],
 )
 def test_every_ray_that_enters_has_one_end(key, rays, lanes):
     for layers in (TWO, MIXED):
@@ -239,7 +243,7 @@ def test_float32_and_float64_agree(x64, key):
         assert agree(single, double) > 0.001
 
 
-@pytest.mark.parametrize("lanes", [16, 4096])
+@pytest.mark.parametrize("lanes", [16, 256, 4096])
 def test_the_number_of_lanes_changes_only_the_draw(key, lanes):
     one, two = walk(TWO, key, 50_000), walk(TWO, key, 50_000, lanes=lanes)
     assert agree(one, two) > 0.001
