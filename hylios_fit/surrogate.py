@@ -13,7 +13,7 @@ import hashlib
 import itertools
 import json
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,7 +57,8 @@ DETOUR = 1.64  # bounces inside melanosomes make light absorbed weakly that much
 ACTIVATIONS = "silu", "squareplus", "tanh"  # of hidden units, functions of `jax.nn`
 FAINT = 3e-3  # optical depth that is as good as none
 SLACK = 1e-5  # of the box's width, for rounding
-BLOCK = 4096  # rows of a batch of more than four blocks: what they need stays in the cache
+BLOCK = 4096  # rows of a batch of more than two blocks: what they need stays in the cache
+VECTORS = {"xla_cpu_prefer_vector_width": 512}  # bits, where a core has them: XLA's own is 256
 
 
 def features(
@@ -318,8 +319,8 @@ class Surrogate(eqx.Module):
         if _traced((self, parameters)):
             return self._evaluate(parameters)
         ready = _ready(self)
-        p = np.asarray(parameters)
         given = _array(parameters, ready.dtype)
+        p = np.asarray(given)
         if p.shape[-1:] == (ready.count,):
             for least, most, one in ready.forms:
                 if ((p >= least) & (p <= most)).all():  # of one form, as most are: half the work
@@ -343,8 +344,9 @@ class Surrogate(eqx.Module):
                 f"expected {len(self.names)} parameters ({', '.join(self.names)}), "
                 f"got {p.shape[-1] if p.ndim else 1}"
             )
-        p = np.atleast_2d(p)
-        (least, most, _), *_ = _ready(self).forms
+        ready = _ready(self)
+        p = np.atleast_2d(_array(p, ready.dtype))
+        (least, most, _), *_ = ready.forms
         member = self.at(self.forms[0])
         wrong = []
         for i, (name, low, high) in enumerate(
@@ -420,13 +422,24 @@ def _traced(tree: Any) -> bool:
 
 @lru_cache(maxsize=32)
 def _compiled(member: Member) -> Callable[[Any], Array]:
-    return jax.jit(lambda p: _in_blocks(member._evaluate, p))
+    return _once(member._evaluate)
 
 
-def _in_blocks(function: Callable[[Any], Array], rows: Any) -> Array:
-    if rows.ndim != 2 or len(rows) <= 4 * BLOCK:
-        return function(rows)
-    return jax.lax.map(function, rows, batch_size=BLOCK)
+def _once(function: Callable[[Any], Array]) -> Callable[[Any], Array]:
+    """Compiled for the widest vectors. Such a program is no part of another: where one is traced,
+    it still answers with numbers."""
+
+    @partial(jax.jit, compiler_options=VECTORS)
+    def compiled(rows: Any) -> Array:
+        if rows.ndim != 2 or len(rows) <= 2 * BLOCK:
+            return function(rows)
+        return jax.lax.map(function, rows, batch_size=BLOCK)
+
+    def answer(rows: Any) -> Array:
+        with jax.ensure_compile_time_eval():
+            return compiled(rows)
+
+    return answer
 
 
 @lru_cache(maxsize=32)
@@ -446,15 +459,13 @@ class _Ready(NamedTuple):
 
 @lru_cache(maxsize=32)
 def _ready(surrogate: Surrogate) -> _Ready:
-    forms = []
+    dtype, forms = surrogate.at(surrogate.forms[0]).centre.dtype, []
     for number, member in enumerate(surrogate.members.values()):
         lower, upper = np.asarray(member.lower, float), np.asarray(member.upper, float)
         slack = SLACK * (upper - lower)
-        one = jax.jit(lambda p, m=member: _in_blocks(m._evaluate, p[..., :-1]))
-        forms.append((np.append(lower - slack, number), np.append(upper + slack, number), one))
-    mixed = jax.jit(lambda p: _in_blocks(surrogate._evaluate, p))
-    dtype = surrogate.at(surrogate.forms[0]).centre.dtype
-    return _Ready(len(surrogate.names), dtype, tuple(forms), mixed)
+        box = [np.append(x, number).astype(dtype) for x in (lower - slack, upper + slack)]
+        forms.append((*box, _once(lambda p, m=member: m._evaluate(p[..., :-1]))))
+    return _Ready(len(surrogate.names), dtype, tuple(forms), _once(surrogate._evaluate))
 
 
 # --- the file ---------------------------------------------------------------------------------
