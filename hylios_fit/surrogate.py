@@ -16,6 +16,7 @@ from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import equinox as eqx
 import jax
@@ -120,7 +121,7 @@ class Member(eqx.Module):
 
     def __call__(self, parameters: Float[Array, "... p"]) -> Float[Array, "... b"]:
         """Compiled when first called with numbers; traced, it is part of what is traced."""
-        if _traced((self, parameters)):
+        if _traced(self, parameters):
             return self._evaluate(parameters)
         return _compiled(self)(_array(parameters, self.centre.dtype))
 
@@ -316,7 +317,7 @@ class Surrogate(eqx.Module):
         return Surrogate(on, self.about)
 
     def __call__(self, parameters: Float[Array, "... q"]) -> Float[Array, "... w"]:
-        if _traced((self, parameters)):
+        if _traced(self, parameters):
             return self._evaluate(parameters)
         ready = _ready(self)
         given = _array(parameters, ready.dtype)
@@ -416,7 +417,18 @@ def _array(numbers: Any, dtype: Any) -> Any:
     return numbers if isinstance(numbers, Array) else np.asarray(numbers, dtype)
 
 
-def _traced(tree: Any) -> bool:
+_ASKED: WeakKeyDictionary[Any, bool] = WeakKeyDictionary()
+
+
+def _traced(module: Member | Surrogate, parameters: Any) -> bool:
+    """Whether any of it is; of a module, which stays what it is, that is looked up once."""
+    found = _ASKED.get(module)
+    if found is None:
+        found = _ASKED[module] = _holds_tracers(module)
+    return found or _holds_tracers(parameters)
+
+
+def _holds_tracers(tree: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
