@@ -25,7 +25,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -40,6 +40,9 @@ from hylios_fit.precision import in_full
 from hylios_fit.results import MISSING, QUANTITIES, Estimate, Fit, Outcome
 from hylios_fit.spectra import Spectra, as_spectra
 from hylios_fit.threads import one_blas_thread
+
+if TYPE_CHECKING:
+    from hylios_fit.planning import Plan
 
 MAX_STEPS = 100
 MORE = 3  # times as many, where the best of the searches ran out of them
@@ -91,12 +94,14 @@ def fit(
     wavelength_range: tuple[float, float] | None = None,
     starts: int = 4,
     key: Array | None = None,
+    plan: Plan | None = None,
 ) -> Fit:
     """Fit one spectrum: melanin, blood and water with their uncertainty.
 
     Args:
         spectrum: what `as_spectra` takes, such as `(wavelength_nm, reflectance)`, holding one.
-        surrogate: the large embedded one, if None.
+        surrogate: the large embedded one, if None. One that is on an instrument's wide bands
+            (`Surrogate.on`) fits spectra of those bands, called by its wavelengths.
         noise: standard deviation of the reflectance: a number, one for each band (B,), or its
             covariance (B, B). None: what came with the spectra, else the instrument's model.
         free: names of the parameters that vary, and `usual` for pigments, blood, water and lipids
@@ -107,6 +112,8 @@ def fit(
         starts: local searches for each form of the melanosomes.
         key: moves the states among which the starts are chosen; without one they are the same
             in every call.
+        plan: of a scene, whose bands the spectrum has: takes its surrogate, frees what matters of
+            what varies there, and holds the rest (`surrogate`, `free` and `fix` are not given).
 
     A spectrum that cannot be fitted comes back with the outcome `unusable` and the reason.
 
@@ -118,7 +125,7 @@ def fit(
         raise HyliosError(f"expected one spectrum, got {len(spectra)}: use fit_many")
     return fit_many(
         spectra, surrogate, noise=noise, free=free, fix=fix, specular=specular,
-        wavelength_range=wavelength_range, starts=starts, key=key, progress=False,
+        wavelength_range=wavelength_range, starts=starts, key=key, plan=plan, progress=False,
     )[0]  # fmt: skip
 
 
@@ -133,6 +140,7 @@ def fit_many(
     wavelength_range: tuple[float, float] | None = None,
     starts: int = 4,
     key: Array | None = None,
+    plan: Plan | None = None,
     progress: bool = True,
 ) -> list[Fit]:
     """Fit each of `spectra` by itself; one `Fit` for each, in their order.
@@ -140,6 +148,10 @@ def fit_many(
     Arguments and errors as for `fit`. `progress`: show a bar when it takes more than 2 s.
     """
     spectra = as_spectra(spectra, wavelength_range=wavelength_range)
+    if plan is not None:
+        if not (surrogate is None and free is None and fix is None):
+            raise HyliosError("a plan says what surrogate, free and fix are: give it or them")
+        surrogate, free, fix = plan.surrogate, plan.varying, plan.fixed
     if surrogate is None:
         from hylios_fit.surrogate import load_surrogate
 
@@ -212,18 +224,19 @@ def _job(
     first = surrogate.at(forms[0])
     vector = statevector.state_vector(first.names, first.lower, first.upper, free, values)
     known = np.asarray(first.wavelength_nm, dtype=np.float64)
-    usable = (wavelength >= known.min()) & (wavelength <= known.max())
+    projected = bool(getattr(first, "projected", False))
+    usable = (wavelength >= known.min()) & (wavelength <= known.max()) | projected
     states = _scan_states(len(vector.free), key)
     noise_text, noise_of, follows = _noise_model(noise, spectra)
     models, error = [], {}
     for form in forms if usable.any() else ():
-        projected = surrogate.at(form).on(wavelength[usable])
-        member = Reported(as_float64(projected), specular)
-        held = projected.surface_at(vector.held)
+        there = surrogate.at(form).on(wavelength[usable])
+        member = Reported(as_float64(there), specular)
+        held = there.surface_at(vector.held)
         unseen = -np.asarray(instrument.specular_offset(held, specular), float)
         scan = np.asarray(_spectra(member, vector, jnp.asarray(states)))
         models.append(Model(form, member, unseen, scan))
-        error[form] = projected.error_covariance
+        error[form] = there.error_covariance
     settings = {
         "noise": noise_text,
         "free": list(vector.free),
@@ -234,6 +247,7 @@ def _job(
         "key": None if key is None else np.asarray(key_data(key)).tolist(),
         "versions": versions(),
         "surrogate": str(getattr(surrogate, "about", {}).get("sha256", "")),
+        **({"on_bands": True} if projected else {}),
         "source": spectra.source,
         "notes": list(spectra.notes),
     }

@@ -27,7 +27,7 @@ from hylios_fit.errors import HyliosError
 from hylios_fit.simulation import Curve, check_request
 from hylios_fit.skin import LAYERS, SPECS, Layers, Specimen
 from hylios_fit.statevector import PRIORS
-from hylios_fit.surrogate import EMBEDDED, load_surrogate
+from hylios_fit.surrogate import EMBEDDED, Surrogate, load_surrogate
 
 SPECIMENS = 128  # that are solved at every wavelength
 PROBES = 8  # of them, on which each parameter is tried
@@ -113,6 +113,11 @@ class Scene:
         weights = self.response * step
         return weights / weights.sum(axis=1, keepdims=True)
 
+    @cached_property
+    def centre_nm(self) -> Float[np.ndarray, "b"]:
+        """The bands' centres of weight, by which a spectrum of the scene calls them."""
+        return self.weights @ self.wavelength_nm
+
     def values(self, share: Float[np.ndarray, "n r"]) -> Float[np.ndarray, "n p"]:
         """All parameters, in the order of `SPECS`, from where each lies in its range (0 to 1)."""
         rows = np.tile(list(self.specimen.values.values()), (len(share), 1))
@@ -185,10 +190,42 @@ class Plan:
     def free(self) -> tuple[str, ...]:
         return tuple(self.told)
 
+    @property
+    def varying(self) -> tuple[str, ...]:
+        """Parameters of the scene's ranges that matter: a fit frees them, told or not, because
+        what the bands do not tell is still not known."""
+        return tuple(name for name in self.scene.ranges if name in self.kept)
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        """What a fit holds: all others, where they were planned."""
+        values = {**self.scene.specimen.values, **{name: self.held[name] for name in self._still}}
+        return {
+            name: value
+            for name, value in values.items()
+            if name in self._member.names and name not in self.varying
+        }
+
+    @property
+    def _still(self) -> list[str]:
+        return [name for name in self.scene.ranges if name in self.dropped]
+
+    @cached_property
+    def surrogate(self) -> Surrogate:
+        """An embedded one on the scene's bands: that of the plan, or the large one where the plan
+        takes the solver. For `fit` and `sample`.
+
+        Raises `HyliosError` for a scene that no surrogate knows.
+        """
+        about = load_surrogate(size=self.size or "large").about
+        return Surrogate({self.scene.specimen.melanosome_form: self._member}, about)
+
     @cached_property
     def _member(self) -> Any:
-        assert self.size is not None
-        return _member(self.scene, self.size)
+        member = _member(self.scene, self.size or "large")
+        if member is None:
+            raise HyliosError("no embedded surrogate knows the specimens or the angle of the scene")
+        return member
 
     def reflectance(self, specimens: Sequence[Specimen]) -> Float[np.ndarray, "n b"]:
         """The bands of many specimens, specular included, by the method of the plan.
@@ -213,7 +250,7 @@ class Plan:
         )
         every = np.ones_like(bands)
         return Curve(
-            self.scene.weights @ self.scene.wavelength_nm, bands, self.error * every,
+            self.scene.centre_nm, bands, self.error * every,
             surface * every, bands - surface, self.method, 0, math.nan * every,
         )  # fmt: skip
 

@@ -117,6 +117,12 @@ def log_posterior(
     if fit.form not in surrogate.forms:
         raise HyliosError(f"the surrogate has no form {fit.form!r}: expected that of the fit")
     whole = surrogate.at(fit.form)
+    if bool(getattr(whole, "projected", False)) != bool(fit.settings.get("on_bands")):
+        raise HyliosError(
+            f"{fit.spectrum!r} was fitted with a surrogate that is "
+            f"{'' if fit.settings.get('on_bands') else 'not '}on an instrument's bands: give that "
+            "one (that of a plan is `plan.surrogate`)"
+        )
     fixed = {k: v for k, v in fit.settings.get("fix", {}).items() if k != "melanosome_form"}
     vector = statevector.state_vector(whole.names, whole.lower, whole.upper, fit.names, fixed)
     used = np.isfinite(np.diag(fit.error_covariance))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -15,6 +15,9 @@ from hylios_fit.errors import HyliosError
 from hylios_fit.skin import Specimen
 from hylios_fit.threads import side_by_side
 from hylios_fit.units import WAVELENGTH_MAX, WAVELENGTH_MIN
+
+if TYPE_CHECKING:
+    from hylios_fit.planning import Plan
 
 METHODS = ("walker", "analog", "adding", "surrogate")
 FIRST = 2 * walker.BATCH  # rays before a tolerance is asked for, where no pilot says how many
@@ -51,7 +54,7 @@ class Curve:
 
 def simulate(
     specimen: Specimen,
-    wavelengths: Any,
+    wavelengths: Any = None,
     method: str = "walker",
     *,
     rays: int = 100_000,
@@ -60,6 +63,7 @@ def simulate(
     tolerance: float | None = None,
     smooth_surface: bool = False,
     independent_particles: bool = False,
+    plan: Plan | None = None,
     progress: bool = False,
 ) -> Curve:
     """Reflectance of `specimen` at `wavelengths` (nm, 250 to 2500) and `incidence` (degrees).
@@ -70,7 +74,15 @@ def simulate(
     `surrogate` asks the large embedded one (8 degrees, its own training range).
     With `tolerance`, rays are added until every standard error is below it, up to `MOST_RAYS`;
     `note` says so if that was not enough. Both walks need a `key` (`jax.random.key(seed)`).
+    With a `plan` the bands are its scene's, by the method and at the incidence that it says.
     """
+    if plan is not None:
+        said = method, incidence, tolerance, smooth_surface, independent_particles
+        if wavelengths is not None or said != ("walker", 8.0, None, False, False):
+            raise HyliosError("a plan says the wavelengths, how, and how well: give it or them")
+        return plan.simulate(specimen)
+    if wavelengths is None:
+        raise HyliosError("give wavelengths, or the plan of a scene")
     nm = np.atleast_1d(np.asarray(wavelengths, float))
     check_request(nm, method, rays, incidence, tolerance)
     if smooth_surface:

@@ -58,6 +58,7 @@ DETOUR = 1.64  # bounces inside melanosomes make light absorbed weakly that much
 ACTIVATIONS = "silu", "squareplus", "tanh"  # of hidden units, functions of `jax.nn`
 FAINT = 3e-3  # optical depth that is as good as none
 SLACK = 1e-5  # of the box's width, for rounding
+SAME_NM = 0.1  # between a band's wavelength and what a spectrum calls it
 BLOCK = 4096  # rows of a batch of more than two blocks: what they need stays in the cache
 VECTORS = {"xla_cpu_prefer_vector_width": 512}  # bits, where a core has them: XLA's own is 256
 
@@ -204,11 +205,16 @@ class Member(eqx.Module):
                 any unit, linear between its samples and 0 outside them. A band is the mean
                 reflectance weighted by it: 1 for what reflects all light.
 
+        On an instrument's bands already, it gives those of them that have these wavelengths.
+
         Raises:
-            HyliosError: bands or responses outside the surrogate's wavelengths, or malformed.
+            HyliosError: bands or responses outside the surrogate's wavelengths, or malformed; bands
+                that it is not on.
         """
         grid = np.asarray(self.wavelength_nm)
         at = np.atleast_1d(np.asarray(wavelength_nm, float))
+        if self.projected and response is None:
+            return self._only(at)
         narrow = _linear(grid, at)
         if response is None:
             return self.onto(narrow, at)
@@ -226,6 +232,24 @@ class Member(eqx.Module):
             simpson[first : first + fine.size - 2 : 2] += factor * np.diff(corners) / 6.0
         sampled = np.stack([np.interp(fine, at, row) for row in wide])
         return self.onto(sampled * simpson @ _linear(grid, fine))
+
+    def _only(self, wavelength_nm: np.ndarray) -> Member:
+        own = np.asarray(self.wavelength_nm)
+        apart = np.abs(wavelength_nm[:, None] - own)
+        which = apart.argmin(axis=1)
+        if not (apart.min(axis=1) <= SAME_NM).all():
+            raise HyliosError(
+                f"the surrogate is on the bands {_listed(own)} nm, asked for "
+                f"{_listed(wavelength_nm)}: take these, or the surrogate itself"
+            )
+        readout = np.eye(len(own)) if self.readout is None else np.asarray(self.readout)
+        return dataclasses.replace(
+            self,
+            wavelength_nm=own[which],
+            readout=jnp.asarray(readout[:, which], self.mean.dtype),
+            modes=self.modes[:, which],
+            rest=self.rest[which],
+        )
 
     def onto(self, weights: Any, wavelength_nm: Any = None) -> Member:
         """This member at bands that are weighted means of its wavelengths.
@@ -389,6 +413,10 @@ class Surrogate(eqx.Module):
         weights = _linear(np.asarray(member.wavelength_nm), bands)
         # the whole spectrum, because that is compiled once for all bands
         return weights @ np.asarray(member(jnp.asarray(parameters[:-1], jnp.float32)), float)
+
+
+def _listed(wavelength_nm: np.ndarray) -> str:
+    return ", ".join(f"{nm:.1f}" for nm in wavelength_nm[:8]) + ", ..." * (len(wavelength_nm) > 8)
 
 
 def _at_once(a: Array, b: Array) -> Array:

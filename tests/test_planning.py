@@ -1,9 +1,11 @@
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 
 import hylios_fit as hf
-from hylios_fit import planning
+from hylios_fit import planning, sampling
 from hylios_fit.skin import LAYERS, SPECS
 
 RANGES = {
@@ -144,6 +146,74 @@ def test_it_can_be_read(camera):
 def test_the_names_to_fit_are_those_of_the_surrogate(camera):
     names = hf.load_surrogate().names
     assert set(camera.free) <= set(names)
+
+
+def test_a_plan_simulates_and_fits_when_asked(camera):
+    """What matters is free, what does not is where it was planned, and the truth is found."""
+    scene = camera.scene
+    specimens = fresh(scene, 6)
+    curve = hf.simulate(specimens[0], plan=camera)
+    np.testing.assert_array_equal(curve.reflectance, camera.simulate(specimens[0]).reflectance)
+    np.testing.assert_array_equal(curve.wavelength_nm, scene.centre_nm)
+    bands = truth(scene, specimens)
+    order = [2, 0, 1, 4, 3, 5]
+    spectra = scene.centre_nm, bands[order]
+    found = hf.fit_many(spectra, noise=0.003, plan=camera, progress=False)
+    within = []
+    for result, specimen in zip(found, (specimens[i] for i in order), strict=True):
+        assert result.outcome.code == "fitted"
+        assert set(result.names) == set(RANGES) - {"water", "lipids"} == set(camera.varying)
+        assert result.fixed["water"] == camera.held["water"] == 1.0
+        assert result.fixed["eumelanin"] == scene.specimen.eumelanin
+        assert result.form == "complex"
+        for name in ("colloidal_melanin", "blood_reticular", "oxygen_saturation"):
+            estimate = result[name]
+            within.append(abs(specimen.values[name] - estimate.value) / estimate.sd)
+        assert result["melanin_mg_per_mL"].informed
+    assert np.mean(np.square(within)) < 2.0
+    assert max(within) < 3.0
+    again = hf.fit((scene.centre_nm, bands[2]), noise=0.003, plan=camera)
+    assert again["melanin_mg_per_mL"] == found[0]["melanin_mg_per_mL"]
+
+
+def test_a_plan_and_what_it_says_are_not_given_together(camera):
+    specimen = hf.Specimen()
+    bands = camera.scene.centre_nm, [0.4, 0.3, 0.2]
+    for more in ({"surrogate": camera.surrogate}, {"free": ["water"]}, {"fix": {"dna": 1.0}}):
+        with pytest.raises(hf.HyliosError, match="what surrogate, free and fix are"):
+            hf.fit(bands, plan=camera, **more)
+    for more in ({"wavelengths": [500.0]}, {"method": "adding"}, {"tolerance": 0.1}):
+        with pytest.raises(hf.HyliosError, match="give it or them"):
+            hf.simulate(specimen, plan=camera, **more)
+    with pytest.raises(hf.HyliosError, match="give wavelengths, or the plan"):
+        hf.simulate(specimen)
+    with pytest.raises(
+        hf.HyliosError, match=r"is on the bands .* 453\.\d nm, asked for 450\.0, 650\.0"
+    ):
+        hf.fit(([450.0, 650.0], [0.2, 0.3]), plan=camera)
+
+
+def test_what_a_plan_fitted_is_sampled_on_its_bands_alone(camera):
+    bands = camera.scene.centre_nm, camera.simulate(fresh(camera.scene, 1)[0]).reflectance
+    result = hf.fit(bands, noise=0.003, plan=camera)
+    with pytest.raises(hf.HyliosError, match=r"is on an instrument's bands.*plan\.surrogate"):
+        hf.sample(result, key=jax.random.key(0))
+    with jax.enable_x64(True):
+        _, density = sampling.log_posterior(result, camera.surrogate)
+        states = result.z + np.array([[0.0], [2.0], [-2.0]])
+        best, *away = density(states)
+    assert np.isfinite(best)
+    assert max(away) < best
+    plain = hf.fit(([450.0, 650.0], [0.2, 0.3]), free=["water"])
+    with pytest.raises(hf.HyliosError, match="is not on an instrument's bands"):
+        hf.sample(plain, key=jax.random.key(0), surrogate=hf.load_surrogate().on([450.0, 650.0]))
+
+
+def test_a_scene_that_no_surrogate_knows_is_not_fitted(camera):
+    scene = dataclasses.replace(camera.scene, incidence=45.0)
+    slanted = dataclasses.replace(camera, scene=scene, method="adding", size=None)
+    with pytest.raises(hf.HyliosError, match="no embedded surrogate knows"):
+        hf.fit((scene.centre_nm, [0.4, 0.3, 0.2]), plan=slanted)
 
 
 def test_specimens_that_the_scene_does_not_speak_of(camera):

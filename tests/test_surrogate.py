@@ -207,9 +207,27 @@ def test_bands_that_cannot_be_are_refused(surrogate):
     with pytest.raises(HyliosError, match=r"expected shape \(bands, 451\), got \(1, 7\)"):
         member.onto(np.ones((1, 7)))
     with pytest.raises(HyliosError, match="project the surrogate itself"):
+        member.on(nm).on(nm, np.ones((1, 2)))
+    with pytest.raises(
+        HyliosError, match=r"on the bands 400\.0, 500\.0 nm, asked for 450\.0: take"
+    ):
         member.on(nm).on([450.0])
     with pytest.raises(HyliosError, match="ask the surrogate itself"):
         surrogate.on(nm).of(Specimen(), [450.0])
+
+
+@pytest.mark.parametrize("wide", [True, False])
+def test_of_its_bands_some_may_be_asked_for_in_any_order(surrogate, wide):
+    nm = np.arange(400.0, 701.0, 20.0)
+    response = np.exp(-0.5 * ((nm - np.array([[600.0], [540.0], [450.0]])) / 30.0) ** 2)
+    member = surrogate.at("complex").on(*((nm, response) if wide else ([600.0, 540.0, 450.0],)))
+    some = member.on(member.wavelength_nm[[2, 0]] + 0.05)
+    row = inside(surrogate, 1)[0, :-1]
+    assert np.allclose(some(row), member(row)[jnp.array([2, 0])], atol=1e-6)
+    assert np.array_equal(some.wavelength_nm, member.wavelength_nm[[2, 0]])
+    level = np.array([0.5, 0.4, 0.3])
+    whole, part = member.error_covariance(level), some.error_covariance(level[[2, 0]])
+    assert np.allclose(part, whole[np.ix_([2, 0], [2, 0])], rtol=1e-4)
 
 
 def test_a_surrogate_on_bands_is_called_as_the_whole_one(surrogate):
