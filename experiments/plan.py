@@ -2,12 +2,15 @@
 
 Four scenes of light to brown skin. Everything is solved first at every wavelength at the usual
 order of the solver (the truth, good to 2e-5 RMS and 2e-4 at most, and its time); then as planned
-for tolerances from 0.0005 to 0.02, on specimens that no plan has seen.
+for tolerances from 0.0005 to 0.02, on specimens that no plan has seen. Their bands, with as much
+noise as the tolerance, are then fitted as planned, and as without a plan: by the large surrogate,
+with the usual parameters free.
 """
 
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -16,9 +19,11 @@ import numpy as np
 
 from experiments import _shared
 from hylios_fit import adding, planning
+from hylios_fit.inversion import fit_many
 from hylios_fit.planning import Plan, Scene, plan
 from hylios_fit.skin import SPECS, Specimen
-from hylios_fit.surrogate import EMBEDDED
+from hylios_fit.statevector import derived
+from hylios_fit.surrogate import EMBEDDED, load_surrogate
 
 RANGES = {
     "melanosome_basale": (0.5, 8.0),
@@ -35,7 +40,11 @@ FRESH = 24
 TRUTH = 8
 TIMED = 32  # specimens at once
 MARKERS = {"solver": "D", "large surrogate": "o", "small surrogate": "s"}
-MODULES = (*_shared.WALK, "adding", "planning", "simulation", "streams", "surrogate", "table")
+ASKED = ("melanin_mg_per_mL", "blood_percent", "oxygen_saturation")
+MODULES = (
+    *_shared.WALK, "adding", "inversion", "planning", "simulation", "statevector", "streams",
+    "surrogate", "table",
+)  # fmt: skip
 
 
 def scenes() -> dict[str, Scene]:
@@ -83,6 +92,8 @@ def _scene(scene: Scene, seed: int) -> dict[str, Any]:
         start = time.perf_counter()
         made = plan(scene, tolerance)
         took = time.perf_counter() - start
+        noise = tolerance * np.random.default_rng(seed + 2).normal(size=truth.shape)
+        measured = scene.centre_nm, truth + noise
         missed = made.reflectance(specimens) - truth
         steps.append(
             {
@@ -101,6 +112,10 @@ def _scene(scene: Scene, seed: int) -> dict[str, Any]:
                 "rms": _shared.significant(np.sqrt(np.mean(missed**2)), 3),
                 "seconds": _shared.significant(_seconds(lambda m=made: _planned(m, many)) / TIMED),
                 "planning_s": _shared.significant(took, 2),
+                "fit": _fitted(rows, measured, tolerance, plan=made),
+                "usual_fit": _fitted(
+                    rows, measured, tolerance, surrogate=_bands(scene), fix=_form(scene)
+                ),
             }
         )
     return {"seconds": _shared.significant(full), "order": adding.ORDER, "steps": steps}
@@ -117,6 +132,48 @@ def _planned(made: Plan, specimens: list[Specimen]) -> np.ndarray:
     return made.reflectance(specimens)
 
 
+def _bands(scene: Scene) -> Any:
+    """The large surrogate on the scene's bands."""
+    return load_surrogate().on(scene.wavelength_nm, scene.response)
+
+
+def _form(scene: Scene) -> dict[str, str]:
+    return {"melanosome_form": scene.specimen.melanosome_form}
+
+
+def _fitted(rows: np.ndarray, measured: Any, noise: float, **how: Any) -> dict[str, Any]:
+    """Core time of a fit, how many of the true values its 68 % intervals hold where the bands tell
+    the quantity, and its median error and interval (half of its width) as a share of the value."""
+
+    def call() -> Any:
+        return fit_many(measured, noise=noise, progress=False, **how)
+
+    seconds = _seconds(call, repeats=1) / len(rows)
+    found = call()
+    true = derived(tuple(SPECS), rows)
+    quantities = {}
+    for name in ASKED:
+        told = [i for i, one in enumerate(found) if one[name].informed]
+        estimates = [found[i][name] for i in told]
+        value, low, high = (
+            np.array([getattr(e, part) for e in estimates]) for part in ("value", "low", "high")
+        )
+        exact = true[name][told]
+        held = (low <= exact) & (exact <= high)
+        quantities[name] = {"told": len(told), "in_68": int(held.sum())}
+        if told:
+            quantities[name] |= {
+                "error": _shared.significant(np.median(np.abs(value / exact - 1.0)), 2),
+                "interval": _shared.significant(np.median((high - low) / (2.0 * value)), 2),
+            }
+    return {
+        "free": len(found[0].names),
+        "outcomes": dict(Counter(one.outcome.code for one in found)),
+        "seconds": _shared.significant(seconds, 2),
+        "quantities": quantities,
+    }
+
+
 def _seconds(call: Callable[[], Any], repeats: int = 5) -> float:
     """Core time, median, compiled."""
     call()
@@ -131,8 +188,8 @@ def _seconds(call: Callable[[], Any], repeats: int = 5) -> float:
 def draw(result: dict[str, Any], path: Any) -> None:
     """Error and time against the tolerance, and what was dropped at each."""
     figure = _shared.figure(13.0, 9.5)
-    grid = figure.add_gridspec(2, 4, height_ratios=(1, 1.25))
-    errors, times = figure.add_subplot(grid[0, :2]), figure.add_subplot(grid[0, 2:])
+    grid = figure.add_gridspec(2, 12, height_ratios=(1, 1.25))
+    errors, times, fits = (figure.add_subplot(grid[0, i : i + 4]) for i in (0, 4, 8))
     tolerances = np.array(result["tolerances"])
     for i, (name, scene) in enumerate(result["scenes"].items()):
         colour = _shared.COLOURS[i]
@@ -150,9 +207,14 @@ def draw(result: dict[str, Any], path: Any) -> None:
                     f"{s['wavelengths']}", (tolerance, at), (-8, 0), textcoords="offset points",
                     fontsize=8, color=colour, ha="right", va="center",
                 )  # fmt: skip
-        _dropped(figure.add_subplot(grid[1, i]), name, steps)
+        for fit, style in (("fit", "o-"), ("usual_fit", "o:")):
+            fits.plot(
+                tolerances, [s[fit]["seconds"] for s in steps], style, color=colour, ms=4,
+                mfc=colour if fit == "fit" else "white",
+            )  # fmt: skip
+        _dropped(figure.add_subplot(grid[1, 3 * i : 3 * i + 3]), name, steps)
     errors.plot(tolerances, tolerances, color="black", lw=1, ls="--", label="tolerance")
-    for axes in (errors, times):
+    for axes in (errors, times, fits):
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_xticks(tolerances, [f"{t:g}" for t in tolerances])
@@ -162,6 +224,7 @@ def draw(result: dict[str, Any], path: Any) -> None:
     times.legend(handles=kinds, fontsize=8.5)
     times.margins(x=0.12)
     _shared.logarithmic(times.yaxis)
+    _shared.logarithmic(fits.yaxis)
     _shared.tidy(
         errors, "tolerance (reflectance)", "error on fresh specimens",
         "filled: largest of any band and specimen; open: RMS",
@@ -169,6 +232,10 @@ def draw(result: dict[str, Any], path: Any) -> None:
     _shared.tidy(
         times, "tolerance (reflectance)", "times faster than everything at order 8",
         "time saved; numbers: wavelengths that are solved",
+    )  # fmt: skip
+    _shared.tidy(
+        fits, "tolerance, and noise of the bands", "core time of a fit (s)",
+        "filled: as planned; open: without a plan",
     )  # fmt: skip
     _shared.save_figure(figure, path)
 

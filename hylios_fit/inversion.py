@@ -113,7 +113,8 @@ def fit(
         key: moves the states among which the starts are chosen; without one they are the same
             in every call.
         plan: of a scene, whose bands the spectrum has: takes its surrogate, frees what matters of
-            what varies there, and holds the rest (`surrogate`, `free` and `fix` are not given).
+            what varies there, within the scene's ranges, and holds the rest (`surrogate`, `free`
+            and `fix` are not given).
 
     A spectrum that cannot be fitted comes back with the outcome `unusable` and the reason.
 
@@ -151,13 +152,14 @@ def fit_many(
     if plan is not None:
         if not (surrogate is None and free is None and fix is None):
             raise HyliosError("a plan says what surrogate, free and fix are: give it or them")
-        surrogate, free, fix = plan.surrogate, plan.varying, plan.fixed
+        surrogate, free, fix = plan.surrogate, tuple(plan.ranges), plan.fixed
     if surrogate is None:
         from hylios_fit.surrogate import load_surrogate
 
         surrogate = load_surrogate()
     with jax.enable_x64(True), one_blas_thread():
-        job = _job(spectra, surrogate, noise, free, fix, specular, starts, key)
+        ranges = None if plan is None else plan.ranges
+        job = _job(spectra, surrogate, noise, free, fix, ranges, specular, starts, key)
         order = range(len(spectra))
         if progress:
             from tqdm import tqdm
@@ -210,6 +212,7 @@ def _job(
     noise: Any,
     free: Iterable[str] | None,
     fix: Mapping[str, Any] | None,
+    ranges: Mapping[str, tuple[float, float]] | None,
     specular: str,
     starts: int,
     key: Array | None,
@@ -222,7 +225,7 @@ def _job(
     values = {name: _number(name, value) for name, value in fix.items()}
     wavelength = spectra.wavelength_nm
     first = surrogate.at(forms[0])
-    vector = statevector.state_vector(first.names, first.lower, first.upper, free, values)
+    vector = statevector.state_vector(first.names, first.lower, first.upper, free, values, ranges)
     known = np.asarray(first.wavelength_nm, dtype=np.float64)
     projected = bool(getattr(first, "projected", False))
     usable = (wavelength >= known.min()) & (wavelength <= known.max()) | projected
@@ -248,6 +251,7 @@ def _job(
         "versions": versions(),
         "surrogate": str(getattr(surrogate, "about", {}).get("sha256", "")),
         **({"on_bands": True} if projected else {}),
+        **({"ranges": {name: list(map(float, r)) for name, r in ranges.items()}} if ranges else {}),
         "source": spectra.source,
         "notes": list(spectra.notes),
     }

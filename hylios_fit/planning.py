@@ -26,7 +26,7 @@ from hylios_fit import adding, fresnel, instrument, skin, table
 from hylios_fit.errors import HyliosError
 from hylios_fit.simulation import Curve, check_request
 from hylios_fit.skin import LAYERS, SPECS, Layers, Specimen
-from hylios_fit.statevector import PRIORS
+from hylios_fit.statevector import PRIORS, by_logarithm
 from hylios_fit.surrogate import EMBEDDED, Surrogate, load_surrogate
 
 SPECIMENS = 128  # that are solved at every wavelength
@@ -122,7 +122,7 @@ class Scene:
         """All parameters, in the order of `SPECS`, from where each lies in its range (0 to 1)."""
         rows = np.tile(list(self.specimen.values.values()), (len(share), 1))
         for at, (name, (low, high)) in zip(share.T, self.ranges.items(), strict=True):
-            wide = low > 0 and high / low > 10  # orders of magnitude
+            wide = by_logarithm(low, high)
             value = low * (high / low) ** at if wide else low + (high - low) * at
             rows[:, _PLACE[name]] = np.clip(value, low, high)
         return rows
@@ -191,24 +191,17 @@ class Plan:
         return tuple(self.told)
 
     @property
-    def varying(self) -> tuple[str, ...]:
-        """Parameters of the scene's ranges that matter: a fit frees them, told or not, because
-        what the bands do not tell is still not known."""
-        return tuple(name for name in self.scene.ranges if name in self.kept)
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Those of the scene that matter: what a fit frees, told or not, because what the bands do
+        not tell is still not known. It is as likely everywhere there, not as in other skin."""
+        return {name: edges for name, edges in self.scene.ranges.items() if name in self.kept}
 
     @property
     def fixed(self) -> dict[str, float]:
-        """What a fit holds: all others, where they were planned."""
-        values = {**self.scene.specimen.values, **{name: self.held[name] for name in self._still}}
-        return {
-            name: value
-            for name, value in values.items()
-            if name in self._member.names and name not in self.varying
-        }
-
-    @property
-    def _still(self) -> list[str]:
-        return [name for name in self.scene.ranges if name in self.dropped]
+        """What a fit holds: all else that its surrogate knows, where it was planned."""
+        values = {**self.scene.specimen.values}
+        values |= {name: self.held[name] for name in self.scene.ranges if name in self.dropped}
+        return {name: values[name] for name in self._member.names if name not in self.ranges}
 
     @cached_property
     def surrogate(self) -> Surrogate:

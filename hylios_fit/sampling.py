@@ -124,7 +124,9 @@ def log_posterior(
             "one (that of a plan is `plan.surrogate`)"
         )
     fixed = {k: v for k, v in fit.settings.get("fix", {}).items() if k != "melanosome_form"}
-    vector = statevector.state_vector(whole.names, whole.lower, whole.upper, fit.names, fixed)
+    vector = statevector.state_vector(
+        whole.names, whole.lower, whole.upper, fit.names, fixed, fit.settings.get("ranges")
+    )
     used = np.isfinite(np.diag(fit.error_covariance))
     specular = fit.settings.get("specular", "included")
     projected = whole.on(fit.wavelength_nm[used])

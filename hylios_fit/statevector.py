@@ -109,6 +109,8 @@ PRIORS: Mapping[str, Prior] = {
 #: Conditioning on a held value at the very edge of the box would put its variable at infinity.
 _U_LIMIT = 3.0
 
+EVEN = 1.702
+"""A logistic curve that much steeper is the normal distribution to 0.01 (Haley 1952)."""
 #: Water of the dermis in % at the model's content.
 DERMIS_WATER_PERCENT = 75.0
 
@@ -218,6 +220,11 @@ def _to_u(vector: StateVector, values: np.ndarray, index: np.ndarray) -> np.ndar
     return (exponent - vector.shift[index]) / vector.slope[index]
 
 
+def by_logarithm(low: float, high: float) -> bool:
+    """Whether a range is even in the logarithm: one of orders of magnitude."""
+    return low > 0 and high / low > 10
+
+
 def prior_correlation(names: Iterable[str]) -> np.ndarray:
     """(P, P) correlation of the unbounded variables: product of the loadings on a shared factor."""
     priors = [PRIORS[name] for name in names]
@@ -234,13 +241,16 @@ def state_vector(
     upper: Any,
     free: Iterable[str] | None = None,
     fix: Mapping[str, float] | None = None,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
 ) -> StateVector:
     """The state vector for a surrogate's parameters and box.
 
     `names` (P), `lower` and `upper` (P,): the surrogate's. `free`: which vary; the word `usual`
     among them, or None, stands for all that their prior calls usual and are not fixed. The others
     stay at the median of their prior, those that are not usual at the model's own value. `fix`:
-    values that are known; the prior of the free ones is conditioned on them.
+    values that are known; the prior of the free ones is conditioned on them. `ranges`: two values
+    between which a free one is known to lie, as likely everywhere there (see `by_logarithm`) and
+    whatever the others are, in the place of its prior.
 
     Raises `HyliosError` for an unknown name, a value outside the box, a name both free and fixed,
     nothing left free, or a parameter that has no declared prior.
@@ -267,6 +277,14 @@ def state_vector(
             raise HyliosError(
                 f"{name} = {value} is outside the surrogate's range {low:g} to {high:g}"
             )
+    ranges = dict(ranges or {})
+    for name, (least, most) in ranges.items():
+        low, high = (edge[names.index(name)] for edge in (lower, upper))
+        if not low <= least < most <= high:
+            raise HyliosError(
+                f"{name} from {least:g} to {most:g} is outside the surrogate's range {low:g} to "
+                f"{high:g}"
+            )
     chosen = tuple(n for n in names if n in free)
     if not chosen:
         raise HyliosError(f"nothing is free: leave at least one of {known}")
@@ -276,6 +294,16 @@ def state_vector(
     offset = np.array([prior.offset or 0.0 for prior in priors])
     median = np.array([prior.median for prior in priors])
     sd = np.array([prior.sd for prior in priors])
+    correlation = prior_correlation(names)
+    lower, upper = lower.copy(), upper.copy()
+    for name, edges in ranges.items():
+        i = names.index(name)
+        lower[i], upper[i] = edges
+        logarithmic[i], offset[i] = by_logarithm(*edges), 0.0
+        low, high = np.log(edges) if logarithmic[i] else edges
+        middle, sd[i] = (low + high) / 2, EVEN * (high - low) / 4
+        median[i] = np.exp(middle) if logarithmic[i] else middle
+        correlation[i] = correlation[:, i] = np.eye(len(names))[i]
     bad = ~((lower < median) & (median < upper))
     bad |= logarithmic & (lower + offset <= 0.0)
     if bad.any():
@@ -299,7 +327,6 @@ def state_vector(
             held[i] = np.clip(SPECS[name].default, lower[i], upper[i])
     for name, value in fix.items():
         held[names.index(name)] = float(value)
-    correlation = prior_correlation(names)
     i = vector.index
     k = np.array([names.index(name) for name in fix], dtype=int)
     known_u = np.clip(_to_u(vector, held[k], k), -_U_LIMIT, _U_LIMIT)

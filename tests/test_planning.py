@@ -162,7 +162,7 @@ def test_a_plan_simulates_and_fits_when_asked(camera):
     within = []
     for result, specimen in zip(found, (specimens[i] for i in order), strict=True):
         assert result.outcome.code == "fitted"
-        assert set(result.names) == set(RANGES) - {"water", "lipids"} == set(camera.varying)
+        assert set(result.names) == set(RANGES) - {"water", "lipids"} == set(camera.ranges)
         assert result.fixed["water"] == camera.held["water"] == 1.0
         assert result.fixed["eumelanin"] == scene.specimen.eumelanin
         assert result.form == "complex"

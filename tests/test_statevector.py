@@ -123,6 +123,26 @@ def test_held_values_are_kept_and_the_prior_is_conditioned_on_them():
     assert np.median(draws[:, 4]) == pytest.approx(np.median(near[:, 4]), rel=0.06)
 
 
+def test_within_ranges_all_is_as_likely_whatever_the_rest_is(draws):
+    ranges = {"melanosome_basale": (2.0, 6.0), "blood_papillary": (0.05, 5.0)}
+    fixed = {"melanosome_granulosum": 0.01}
+    vector = statevector.state_vector(NAMES, LOWER, UPPER, fix=fixed, ranges=ranges)
+    some = dict(zip(NAMES, vector.prior_draws(jax.random.key(2), 20_000).T, strict=True))
+    linear = (some["melanosome_basale"] - 2.0) / 4.0
+    orders = np.log(some["blood_papillary"] / 0.05) / np.log(100.0)
+    for share in (linear, orders):
+        assert np.all((share >= 0.0) & (share <= 1.0))
+        at = np.linspace(0.05, 0.95, 19)
+        np.testing.assert_allclose([np.mean(share < x) for x in at], at, atol=0.02)
+    # nothing is known of them from the others, nor of the others from them
+    assert abs(np.corrcoef(linear, some["colloidal_melanin"])[0, 1]) < 0.03
+    assert abs(np.corrcoef(orders, some["blood_reticular"])[0, 1]) < 0.03
+    elsewhere = draws[:, NAMES.index("blood_reticular")]
+    assert np.median(some["blood_reticular"]) == pytest.approx(np.median(elsewhere), rel=0.05)
+    with pytest.raises(HyliosError, match=r"water from 0.1 to 1 is outside .* range 0\.\d+ to"):
+        statevector.state_vector(NAMES, LOWER, UPPER, ranges={"water": (0.1, 1.0)})
+
+
 def test_what_is_not_free_stays_at_the_median_without_conditioning():
     only = statevector.state_vector(NAMES, LOWER, UPPER, free=["water", "melanosome_basale"])
     assert only.free == ("melanosome_basale", "water")  # the declared order, not the caller's
