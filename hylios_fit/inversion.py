@@ -103,7 +103,8 @@ def fit(
         surrogate: the large embedded one, if None. One that is on an instrument's wide bands
             (`Surrogate.on`) fits spectra of those bands, called by its wavelengths.
         noise: standard deviation of the reflectance: a number, one for each band (B,), or its
-            covariance (B, B). None: what came with the spectra, else the instrument's model.
+            covariance (B, B), of the bands that are used, in the order of the spectrum. None: what
+            came with the spectra, else the instrument's model.
         free: names of the parameters that vary, and `usual` for pigments, blood, water and lipids
             (the default); see `statevector.state_vector` for where the others stay.
         fix: values of parameters that are known; `melanosome_form` may be one of them.
@@ -112,9 +113,10 @@ def fit(
         starts: local searches for each form of the melanosomes.
         key: moves the states among which the starts are chosen; without one they are the same
             in every call.
-        plan: of a scene, whose bands the spectrum has: takes its surrogate, frees what matters of
-            what varies there, within the scene's ranges, and holds the rest (`surrogate`, `free`
-            and `fix` are not given).
+        plan: of a scene whose bands the spectrum has, called by `plan.scene.centre_nm`. Takes its
+            surrogate, frees what matters of what varies there, within the scene's ranges, and holds
+            the rest (`surrogate`, `free` and `fix` are not given); what that leaves out is added to
+            the noise.
 
     A spectrum that cannot be fitted comes back with the outcome `unusable` and the reason.
 
@@ -153,13 +155,17 @@ def fit_many(
         if not (surrogate is None and free is None and fix is None):
             raise HyliosError("a plan says what surrogate, free and fix are: give it or them")
         surrogate, free, fix = plan.surrogate, tuple(plan.ranges), plan.fixed
+        if not free:
+            raise HyliosError(
+                f"nothing that varies in the scene matters to within {plan.tolerance:g}: "
+                "plan for a smaller tolerance"
+            )
     if surrogate is None:
         from hylios_fit.surrogate import load_surrogate
 
         surrogate = load_surrogate()
     with jax.enable_x64(True), one_blas_thread():
-        ranges = None if plan is None else plan.ranges
-        job = _job(spectra, surrogate, noise, free, fix, ranges, specular, starts, key)
+        job = _job(spectra, surrogate, noise, free, fix, plan, specular, starts, key)
         order = range(len(spectra))
         if progress:
             from tqdm import tqdm
@@ -212,7 +218,7 @@ def _job(
     noise: Any,
     free: Iterable[str] | None,
     fix: Mapping[str, Any] | None,
-    ranges: Mapping[str, tuple[float, float]] | None,
+    plan: Plan | None,
     specular: str,
     starts: int,
     key: Array | None,
@@ -225,21 +231,23 @@ def _job(
     values = {name: _number(name, value) for name, value in fix.items()}
     wavelength = spectra.wavelength_nm
     first = surrogate.at(forms[0])
+    ranges = {} if plan is None else plan.ranges
     vector = statevector.state_vector(first.names, first.lower, first.upper, free, values, ranges)
     known = np.asarray(first.wavelength_nm, dtype=np.float64)
-    projected = bool(getattr(first, "projected", False))
-    usable = (wavelength >= known.min()) & (wavelength <= known.max()) | projected
+    usable = (wavelength >= known.min()) & (wavelength <= known.max()) | first.projected
     states = _scan_states(len(vector.free), key)
     noise_text, noise_of, follows = _noise_model(noise, spectra)
+    if plan is not None:
+        noise_of = _with_dropped(noise_of, plan.dropped_sd)
     models, error = [], {}
     for form in forms if usable.any() else ():
-        there = surrogate.at(form).on(wavelength[usable])
-        member = Reported(as_float64(there), specular)
-        held = there.surface_at(vector.held)
+        projected = surrogate.at(form).on(wavelength[usable])
+        member = Reported(as_float64(projected), specular)
+        held = projected.surface_at(vector.held)
         unseen = -np.asarray(instrument.specular_offset(held, specular), float)
         scan = np.asarray(_spectra(member, vector, jnp.asarray(states)))
         models.append(Model(form, member, unseen, scan))
-        error[form] = there.error_covariance
+        error[form] = projected.error_covariance
     settings = {
         "noise": noise_text,
         "free": list(vector.free),
@@ -250,12 +258,17 @@ def _job(
         "key": None if key is None else np.asarray(key_data(key)).tolist(),
         "versions": versions(),
         "surrogate": str(getattr(surrogate, "about", {}).get("sha256", "")),
-        **({"on_bands": True} if projected else {}),
-        **({"ranges": {name: list(map(float, r)) for name, r in ranges.items()}} if ranges else {}),
+        **({"on_bands": True} if first.projected else {}),
+        **({"ranges": {name: [*edges] for name, edges in ranges.items()}} if ranges else {}),
         "source": spectra.source,
         "notes": list(spectra.notes),
     }
     return _Job(tuple(models), vector, usable, states, noise_of, follows, error, starts, settings)
+
+
+def _with_dropped(covariance: Any, sd: float) -> Any:
+    """Noise, and what a plan holds though it varies, on each band by itself."""
+    return lambda reflectance: covariance(reflectance) + sd**2 * np.eye(len(reflectance))
 
 
 def _forms(surrogate: Any, wanted: Any) -> tuple[str, ...]:
@@ -323,6 +336,8 @@ def _noise_model(noise: Any, spectra: Spectra) -> tuple[Any, Any, bool]:
     """What is recorded of the noise, the function from (B,) reflectance to its covariance, and
     whether that depends on the reflectance."""
     wavelength = spectra.wavelength_nm
+    came = wavelength if spectra.came_nm is None else spectra.came_nm
+    rising = np.argsort(came)
     text: Any = "given for each band"
     follows = False
     if noise is None and spectra.noise is not None:
@@ -337,12 +352,15 @@ def _noise_model(noise: Any, spectra: Spectra) -> tuple[Any, Any, bool]:
             raise HyliosError(
                 f"noise: expected shape ({wavelength.size}, {wavelength.size}), got {given.shape}"
             )
+        given = given[np.ix_(rising, rising)]
         if not np.all(np.isfinite(given)) or not np.allclose(given, given.T):
             raise HyliosError("noise: expected a symmetric covariance of finite numbers")
         if np.any(np.diag(given) <= 0) or np.linalg.eigvalsh(given)[0] < -1e-9 * given.max():
             raise HyliosError("noise: expected a covariance, got one with variances not above 0")
         return "given as a covariance", lambda reflectance: given, False
     instrument.noise_sd(wavelength, np.zeros(wavelength.size), noise)  # refuses what is no noise
+    if text == "given for each band":
+        noise = np.asarray(noise, dtype=np.float64)[rising]
 
     def covariance(reflectance: np.ndarray) -> np.ndarray:
         return instrument.noise_covariance(wavelength, reflectance, noise)

@@ -115,7 +115,7 @@ class Scene:
 
     @cached_property
     def centre_nm(self) -> Float[np.ndarray, "b"]:
-        """The bands' centres of weight, by which a spectrum of the scene calls them."""
+        """The bands' centres of weight, by which a spectrum that is fitted calls them."""
         return self.weights @ self.wavelength_nm
 
     def values(self, share: Float[np.ndarray, "n r"]) -> Float[np.ndarray, "n p"]:
@@ -165,9 +165,9 @@ class Plan:
         bands (B,) = offset + matrix @ reflectance at these wavelengths.
     error
         the largest error of a band that was seen on the specimens tried.
-    free, told
+    told
         parameters that the bands tell more of than their ranges do, the best told first, if all
-        the others are known, and posterior over prior sd of each.
+        the others are known: posterior over prior sd of each.
     """
 
     scene: Scene
@@ -187,21 +187,28 @@ class Plan:
     told: Mapping[str, float]
 
     @property
-    def free(self) -> tuple[str, ...]:
-        return tuple(self.told)
-
-    @property
     def ranges(self) -> dict[str, tuple[float, float]]:
         """Those of the scene that matter: what a fit frees, told or not, because what the bands do
         not tell is still not known. It is as likely everywhere there, not as in other skin."""
         return {name: edges for name, edges in self.scene.ranges.items() if name in self.kept}
 
     @property
-    def fixed(self) -> dict[str, float]:
+    def fixed(self) -> dict[str, Any]:
         """What a fit holds: all else that its surrogate knows, where it was planned."""
-        values = {**self.scene.specimen.values}
-        values |= {name: self.held[name] for name in self.scene.ranges if name in self.dropped}
-        return {name: values[name] for name in self._member.names if name not in self.ranges}
+        specimen = self.scene.specimen
+        values: dict[str, Any] = {**specimen.values}
+        values |= {name: self.held[name] for name in self._unseen}
+        found = {name: values[name] for name in self._member.names if name not in self.ranges}
+        return found | {"melanosome_form": specimen.melanosome_form}
+
+    @property
+    def dropped_sd(self) -> float:
+        """What the ranges that are dropped do to a band, at most: a standard deviation."""
+        return math.sqrt(sum(self.dropped[name] ** 2 for name in self._unseen) / 3.0)
+
+    @property
+    def _unseen(self) -> list[str]:
+        return [name for name in self.scene.ranges if name in self.dropped]
 
     @cached_property
     def surrogate(self) -> Surrogate:
@@ -210,15 +217,14 @@ class Plan:
 
         Raises `HyliosError` for a scene that no surrogate knows.
         """
-        about = load_surrogate(size=self.size or "large").about
-        return Surrogate({self.scene.specimen.melanosome_form: self._member}, about)
-
-    @cached_property
-    def _member(self) -> Any:
-        member = _member(self.scene, self.size or "large")
-        if member is None:
+        found = _projected(self.scene, self.size or "large")
+        if found is None:
             raise HyliosError("no embedded surrogate knows the specimens or the angle of the scene")
-        return member
+        return found
+
+    @property
+    def _member(self) -> Any:
+        return self.surrogate.at(self.scene.specimen.melanosome_form)
 
     def reflectance(self, specimens: Sequence[Specimen]) -> Float[np.ndarray, "n b"]:
         """The bands of many specimens, specular included, by the method of the plan.
@@ -314,9 +320,10 @@ def plan(scene: Scene, tolerance: float) -> Plan:
         out.pop()
     method, taken = "adding", None
     for size in EMBEDDED:
-        member = _member(scene, size)
-        if member is None:
+        found = _projected(scene, size)
+        if found is None:
             continue
+        member = found.at(scene.specimen.melanosome_form)
         missed = float(np.max(np.abs(_asked(member, rows) - truth)))
         if missed <= 0.75 * tolerance:
             method, taken, error = "surrogate", size, missed
@@ -521,7 +528,7 @@ def _told(fisher: np.ndarray, names: tuple[str, ...], out: Sequence[str]) -> dic
 # --- the surrogate ------------------------------------------------------------------------------
 
 
-def _member(scene: Scene, size: str) -> Any:
+def _projected(scene: Scene, size: str) -> Surrogate | None:
     """An embedded surrogate on the scene's bands; None where it knows no such scene."""
     try:
         surrogate = load_surrogate(size=size)
@@ -533,7 +540,9 @@ def _member(scene: Scene, size: str) -> Any:
         if strange or scene.incidence != surrogate.incidence_deg:
             return None
         grid = instrument.interpolation_matrix(surrogate.wavelength_nm, scene.wavelength_nm)
-        return surrogate.at(scene.specimen.melanosome_form).onto(scene.weights @ grid)
+        weights = scene.weights @ grid
+        on = {form: surrogate.at(form).onto(weights) for form in surrogate.forms}
+        return Surrogate(on, surrogate.about) if scene.specimen.melanosome_form in on else None
     except HyliosError:
         return None
 

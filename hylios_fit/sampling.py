@@ -117,7 +117,7 @@ def log_posterior(
     if fit.form not in surrogate.forms:
         raise HyliosError(f"the surrogate has no form {fit.form!r}: expected that of the fit")
     whole = surrogate.at(fit.form)
-    if bool(getattr(whole, "projected", False)) != bool(fit.settings.get("on_bands")):
+    if whole.projected != bool(fit.settings.get("on_bands")):
         raise HyliosError(
             f"{fit.spectrum!r} was fitted with a surrogate that is "
             f"{'' if fit.settings.get('on_bands') else 'not '}on an instrument's bands: give that "

@@ -74,11 +74,13 @@ def simulate(
     `surrogate` asks the large embedded one (8 degrees, its own training range).
     With `tolerance`, rays are added until every standard error is below it, up to `MOST_RAYS`;
     `note` says so if that was not enough. Both walks need a `key` (`jax.random.key(seed)`).
-    With a `plan` the bands are its scene's, by the method and at the incidence that it says.
+    With the `plan` of a scene the bands are the scene's, by the method and at the incidence that it
+    says: nothing else is given.
     """
     if plan is not None:
-        said = method, incidence, tolerance, smooth_surface, independent_particles
-        if wavelengths is not None or said != ("walker", 8.0, None, False, False):
+        said = method, rays, incidence, tolerance, smooth_surface, independent_particles
+        usual = "walker", 100_000, 8.0, None, False, False
+        if wavelengths is not None or key is not None or said != usual:
             raise HyliosError("a plan says the wavelengths, how, and how well: give it or them")
         return plan.simulate(specimen)
     if wavelengths is None:

@@ -13,7 +13,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +76,8 @@ class Spectra:
     """Where they come from: a file's path, or a kind of object."""
     noise: np.ndarray | None = field(default=None)
     """Standard deviation of the noise given with the spectra, shape (bands,), or None."""
+    came_nm: np.ndarray | None = field(default=None)
+    """The wavelengths in the order in which they came; None where that is theirs."""
 
     def __post_init__(self) -> None:
         wavelength = _frozen(self.wavelength_nm)
@@ -115,14 +117,11 @@ class Spectra:
     def select(self, indices: Sequence[int]) -> Spectra:
         """The spectra at these positions, in this order."""
         chosen = list(indices)
-        return Spectra(
-            self.wavelength_nm,
-            tuple(self.names[i] for i in chosen),
-            self.reflectance[chosen],
-            tuple(self.problems[i] for i in chosen),
-            self.notes,
-            self.source,
-            self.noise,
+        return replace(
+            self,
+            names=tuple(self.names[i] for i in chosen),
+            reflectance=self.reflectance[chosen],
+            problems=tuple(self.problems[i] for i in chosen),
         )
 
 
@@ -520,7 +519,10 @@ def _judge(
     fine = np.array([problem is None for problem in problems])[:, None]
     _note_tolerated(names, values, fine & finite & (values < 0), "slightly below 0", notes)
     _note_tolerated(names, values, fine & finite & (values > 1), "slightly above 1", notes)
-    return Spectra(wavelength, tuple(names), values, tuple(problems), tuple(notes), source, noise)
+    came = grid.wavelength[np.sort(order)] if np.any(np.diff(order) < 0) else None
+    return Spectra(
+        wavelength, tuple(names), values, tuple(problems), tuple(notes), source, noise, came
+    )
 
 
 def _ordered(grid: _Grid, notes: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -804,14 +806,14 @@ def as_spectra(
 def _cropped(spectra: Spectra, wavelength_range: tuple[float, float]) -> Spectra:
     notes = list(spectra.notes)
     kept = _kept(spectra.wavelength_nm, wavelength_range, notes, spectra.source)
-    return Spectra(
-        spectra.wavelength_nm[kept],
-        spectra.names,
-        spectra.reflectance[:, kept],
-        spectra.problems,
-        tuple(notes),
-        spectra.source,
-        None if spectra.noise is None else spectra.noise[kept],
+    left, came = spectra.wavelength_nm[kept], spectra.came_nm
+    return replace(
+        spectra,
+        wavelength_nm=left,
+        reflectance=spectra.reflectance[:, kept],
+        notes=tuple(notes),
+        noise=None if spectra.noise is None else spectra.noise[kept],
+        came_nm=None if came is None else came[np.isin(came, left)],
     )
 
 

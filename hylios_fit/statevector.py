@@ -27,6 +27,7 @@ from jaxtyping import Array, Float
 from hylios_fit.errors import HyliosError
 from hylios_fit.precision import product
 from hylios_fit.skin import SPECS, STRATA
+from hylios_fit.surrogate import SLACK
 
 
 @dataclass(frozen=True)
@@ -263,6 +264,12 @@ def state_vector(
     for name in (*free, *fix):
         if name not in names:
             raise HyliosError(f"unknown parameter {name!r}; the surrogate knows: {known}")
+    for name, (low, high) in (ranges or {}).items():
+        if name not in free or not low < high:
+            raise HyliosError(
+                f"{name} from {low:g} to {high:g}: expected two rising values of one "
+                f"that is free ({', '.join(free)})"
+            )
     undeclared = [name for name in names if name not in PRIORS]
     if undeclared:
         raise HyliosError(
@@ -271,20 +278,18 @@ def state_vector(
     both = set(free) & set(fix)
     if both:
         raise HyliosError(f"both free and fixed: {', '.join(sorted(both))}")
-    for name, value in fix.items():
+
+    def inside(name: str, value: float) -> float:
         low, high = lower[names.index(name)], upper[names.index(name)]
-        if not low <= float(value) <= high:
+        slack = SLACK * (high - low)
+        if not low - slack <= float(value) <= high + slack:
             raise HyliosError(
                 f"{name} = {value} is outside the surrogate's range {low:g} to {high:g}"
             )
-    ranges = dict(ranges or {})
-    for name, (least, most) in ranges.items():
-        low, high = (edge[names.index(name)] for edge in (lower, upper))
-        if not low <= least < most <= high:
-            raise HyliosError(
-                f"{name} from {least:g} to {most:g} is outside the surrogate's range {low:g} to "
-                f"{high:g}"
-            )
+        return float(np.clip(value, low, high))
+
+    fix = {name: inside(name, value) for name, value in fix.items()}
+    ranges = {name: (inside(name, a), inside(name, b)) for name, (a, b) in (ranges or {}).items()}
     chosen = tuple(n for n in names if n in free)
     if not chosen:
         raise HyliosError(f"nothing is free: leave at least one of {known}")
@@ -326,7 +331,7 @@ def state_vector(
         if not prior.usual:
             held[i] = np.clip(SPECS[name].default, lower[i], upper[i])
     for name, value in fix.items():
-        held[names.index(name)] = float(value)
+        held[names.index(name)] = value
     i = vector.index
     k = np.array([names.index(name) for name in fix], dtype=int)
     known_u = np.clip(_to_u(vector, held[k], k), -_U_LIMIT, _U_LIMIT)

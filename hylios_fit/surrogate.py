@@ -59,6 +59,7 @@ ACTIVATIONS = "silu", "squareplus", "tanh"  # of hidden units, functions of `jax
 FAINT = 3e-3  # optical depth that is as good as none
 SLACK = 1e-5  # of the box's width, for rounding
 SAME_NM = 0.1  # between a band's wavelength and what a spectrum calls it
+AGAIN = "project the surrogate itself, not one that is on bands already"
 BLOCK = 4096  # rows of a batch of more than two blocks: what they need stays in the cache
 VECTORS = {"xla_cpu_prefer_vector_width": 512}  # bits, where a core has them: XLA's own is 256
 
@@ -213,7 +214,9 @@ class Member(eqx.Module):
         """
         grid = np.asarray(self.wavelength_nm)
         at = np.atleast_1d(np.asarray(wavelength_nm, float))
-        if self.projected and response is None:
+        if self.projected:
+            if response is not None:
+                raise HyliosError(AGAIN)
             return self._only(at)
         narrow = _linear(grid, at)
         if response is None:
@@ -235,13 +238,15 @@ class Member(eqx.Module):
 
     def _only(self, wavelength_nm: np.ndarray) -> Member:
         own = np.asarray(self.wavelength_nm)
-        apart = np.abs(wavelength_nm[:, None] - own)
-        which = apart.argmin(axis=1)
-        if not (apart.min(axis=1) <= SAME_NM).all():
+        near = np.abs(_wavelengths(wavelength_nm)[:, None] - own) <= SAME_NM
+        if not (near.sum(axis=1) == 1).all():
+            asked = wavelength_nm[near.sum(axis=1) != 1][0]
+            bands = ", ".join(f"{nm:.1f}" for nm in own[:8]) + ", ..." * (len(own) > 8)
             raise HyliosError(
-                f"the surrogate is on the bands {_listed(own)} nm, asked for "
-                f"{_listed(wavelength_nm)}: take these, or the surrogate itself"
+                f"the surrogate is on the bands {bands} nm: {asked:.1f} nm is none of them, or "
+                f"more than one (to {SAME_NM:g} nm)"
             )
+        which = near.argmax(axis=1)
         readout = np.eye(len(own)) if self.readout is None else np.asarray(self.readout)
         return dataclasses.replace(
             self,
@@ -261,7 +266,7 @@ class Member(eqx.Module):
         grid = np.asarray(self.wavelength_nm)
         w = np.asarray(weights, float)
         if self.projected:
-            raise HyliosError("project the surrogate itself, not one that is on bands already")
+            raise HyliosError(AGAIN)
         if w.ndim != 2 or w.shape[1] != len(grid):
             raise HyliosError(f"weights: expected shape (bands, {len(grid)}), got {w.shape}")
         if not (np.isfinite(w).all() and (w >= 0).all() and (w.sum(axis=1) > 0).all()):
@@ -357,8 +362,8 @@ class Surrogate(eqx.Module):
         p = jnp.asarray(parameters)
         form = p[..., -1:]
         found: Any = jnp.nan
-        for number, member in enumerate(self.members.values()):
-            found = jnp.where(form == number, member(p[..., :-1]), found)
+        for name, member in self.members.items():
+            found = jnp.where(form == _number(name), member(p[..., :-1]), found)
         return found
 
     def check(self, parameters: np.ndarray) -> None:
@@ -381,9 +386,10 @@ class Surrogate(eqx.Module):
             bad = ~((x >= least[i]) & (x <= most[i]))
             if bad.any():
                 wrong.append(f"{name} = {x[bad].flat[0]:g} (trained on {low:g} to {high:g})")
-        if not np.isin(p[..., -1], range(len(self.forms))).all():
+        if not np.isin(p[..., -1], [_number(form) for form in self.forms]).all():
+            known = ", ".join(f"{_number(form)} {form}" for form in self.forms)
             wrong.append(
-                "melanosome_form (0 complex, 1 dispersed; it was not trained on "
+                f"melanosome_form ({known}; it was not trained on "
                 f"{', '.join(f for f in melanosome.FORMS if f not in self.forms)})"
             )
         if wrong:
@@ -415,18 +421,19 @@ class Surrogate(eqx.Module):
         return weights @ np.asarray(member(jnp.asarray(parameters[:-1], jnp.float32)), float)
 
 
-def _listed(wavelength_nm: np.ndarray) -> str:
-    return ", ".join(f"{nm:.1f}" for nm in wavelength_nm[:8]) + ", ..." * (len(wavelength_nm) > 8)
-
-
 def _at_once(a: Array, b: Array) -> Array:
     return jnp.asarray(np.asarray(a, float) @ np.asarray(b, float), a.dtype)
 
 
-def _linear(grid: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """(B, W): linear interpolation from the grid to each wavelength."""
+def _wavelengths(at: np.ndarray) -> np.ndarray:
     if at.ndim != 1 or not at.size or not np.isfinite(at).all():
         raise HyliosError(f"bands: expected a list of wavelengths in nm, got shape {at.shape}")
+    return at
+
+
+def _linear(grid: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """(B, W): linear interpolation from the grid to each wavelength."""
+    _wavelengths(at)
     if at.min() < grid[0] or at.max() > grid[-1]:
         raise HyliosError(
             f"the surrogate covers {grid[0]:g} to {grid[-1]:g} nm, "
@@ -439,6 +446,11 @@ def _linear(grid: np.ndarray, at: np.ndarray) -> np.ndarray:
     weights[rows, low] = 1.0 - part
     weights[rows, low + 1] = part
     return weights
+
+
+def _number(form: str) -> int:
+    """What stands for a form among parameters, also where it is the only one."""
+    return melanosome.FORMS.index(form)
 
 
 def _array(numbers: Any, dtype: Any) -> Any:
@@ -500,10 +512,10 @@ class _Ready(NamedTuple):
 @lru_cache(maxsize=32)
 def _ready(surrogate: Surrogate) -> _Ready:
     dtype, forms = surrogate.at(surrogate.forms[0]).centre.dtype, []
-    for number, member in enumerate(surrogate.members.values()):
+    for form, member in surrogate.members.items():
         lower, upper = np.asarray(member.lower, float), np.asarray(member.upper, float)
         slack = SLACK * (upper - lower)
-        box = [np.append(x, number).astype(dtype) for x in (lower - slack, upper + slack)]
+        box = [np.append(x, _number(form)).astype(dtype) for x in (lower - slack, upper + slack)]
         forms.append((*box, _once(lambda p, m=member: m._evaluate(p[..., :-1]))))
     return _Ready(len(surrogate.names), dtype, tuple(forms), _once(surrogate._evaluate))
 

@@ -12,7 +12,7 @@ from hylios_fit.errors import HyliosError
 from hylios_fit.instrument import noise_covariance
 from hylios_fit.results import QUANTITIES, Estimate, Fit, Outcome
 from hylios_fit.skin import Specimen
-from hylios_fit.spectra import Spectra
+from hylios_fit.spectra import Spectra, as_spectra
 from hylios_fit.surrogate import load_surrogate
 
 TOY = ToySurrogate()
@@ -419,6 +419,24 @@ def test_noise_for_each_band_is_the_same_as_its_covariance():
     np.testing.assert_array_equal(one(values, noise=sd).z, one(values, noise=np.diag(sd**2)).z)
     spectra = Spectra(VISIBLE, ("s",), values[None], (None,), noise=sd)
     np.testing.assert_array_equal(inversion.fit(spectra, TOY).z, one(values, noise=sd).z)
+
+
+def test_noise_for_each_band_is_in_the_order_of_the_spectrum():
+    values = reflectance(LIGHT, VISIBLE)[0]
+    sd = np.linspace(0.002, 0.006, 31)
+    at = np.random.default_rng(0).permutation(31)
+    expected, cut = one(values, noise=sd), one(values[5:], VISIBLE[5:], noise=sd[5:])
+    for noise in (sd[at], np.diag(sd[at] ** 2)):
+        mixed = one(values[at], VISIBLE[at], noise=noise)
+        np.testing.assert_array_equal(mixed.wavelength_nm, VISIBLE)
+        np.testing.assert_array_equal(mixed.z, expected.z)
+    # what a range leaves out has no noise
+    left, limits = at[at >= 5], (VISIBLE[5], VISIBLE[-1])
+    mixed = one(values[at], VISIBLE[at], noise=sd[left], wavelength_range=limits)
+    np.testing.assert_array_equal(mixed.z, cut.z)
+    whole = as_spectra((VISIBLE[at], values[at]))
+    again = inversion.fit(whole, TOY, noise=sd[left], wavelength_range=limits)
+    np.testing.assert_array_equal(again.z, cut.z)
 
 
 def test_less_noise_tells_more():

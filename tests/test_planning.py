@@ -58,13 +58,13 @@ def test_a_camera_keeps_the_pigments_and_no_lipids(camera):
 
 def test_the_infrared_keeps_water_and_lipids(infrared):
     assert {"water", "lipids"} <= set(infrared.kept)
-    assert "water" in infrared.free
+    assert "water" in infrared.told
     assert {"beta_carotene", "bilirubin"} <= set(infrared.dropped)
 
 
 def test_what_the_bands_can_tell(camera):
-    assert {"blood_papillary", "blood_reticular"} & set(camera.free)
-    assert not {"lipids", "water"} & set(camera.free)
+    assert {"blood_papillary", "blood_reticular"} & set(camera.told)
+    assert not {"lipids", "water"} & set(camera.told)
     assert all(0 < share < 1 for share in camera.told.values())
     # of two that do the same one is told, of two that do not both, and nothing of what is dropped
     same, apart = np.full((2, 2), 100.0), np.diag([50.0, 100.0])
@@ -117,11 +117,10 @@ def test_a_curve_with_its_error(camera):
 def test_the_smaller_surrogate_that_will_do_is_taken(camera, monkeypatch):
     assert (camera.method, camera.size) == ("surrogate", "small")
     # where that is off by a hundredth it will not, and the other is asked
-    member = planning._member
-    small = member(camera.scene, "small")
-    monkeypatch.setattr(
-        planning, "_member", lambda scene, size: small if size == "small" else member(scene, size)
-    )
+    projected = planning._projected
+    both = {size: projected(camera.scene, size) for size in ("small", "large")}
+    small = both["small"].at("complex")
+    monkeypatch.setattr(planning, "_projected", lambda scene, size: both[size])
     asked = planning._asked
     monkeypatch.setattr(
         planning, "_asked", lambda one, rows: asked(one, rows) + (0.01 if one is small else 0.0)
@@ -129,7 +128,7 @@ def test_the_smaller_surrogate_that_will_do_is_taken(camera, monkeypatch):
     made = hf.plan(camera.scene, TOLERANCE)
     assert (made.method, made.size) == ("surrogate", "large")
     assert made.error <= 0.75 * TOLERANCE
-    assert made._member is not small
+    assert made.surrogate is both["large"]
     # and where both are, the solver
     monkeypatch.setattr(planning, "_asked", lambda one, rows: asked(one, rows) + 0.01)
     made = hf.plan(camera.scene, TOLERANCE)
@@ -145,7 +144,7 @@ def test_it_can_be_read(camera):
 
 def test_the_names_to_fit_are_those_of_the_surrogate(camera):
     names = hf.load_surrogate().names
-    assert set(camera.free) <= set(names)
+    assert set(camera.told) <= set(names)
 
 
 def test_a_plan_simulates_and_fits_when_asked(camera):
@@ -182,13 +181,13 @@ def test_a_plan_and_what_it_says_are_not_given_together(camera):
     for more in ({"surrogate": camera.surrogate}, {"free": ["water"]}, {"fix": {"dna": 1.0}}):
         with pytest.raises(hf.HyliosError, match="what surrogate, free and fix are"):
             hf.fit(bands, plan=camera, **more)
-    for more in ({"wavelengths": [500.0]}, {"method": "adding"}, {"tolerance": 0.1}):
+    for more in ({"wavelengths": [500.0]}, {"method": "adding"}, {"tolerance": 0.1}, {"rays": 9}):
         with pytest.raises(hf.HyliosError, match="give it or them"):
             hf.simulate(specimen, plan=camera, **more)
     with pytest.raises(hf.HyliosError, match="give wavelengths, or the plan"):
         hf.simulate(specimen)
     with pytest.raises(
-        hf.HyliosError, match=r"is on the bands .* 453\.\d nm, asked for 450\.0, 650\.0"
+        hf.HyliosError, match=r"on the bands .* 453\.\d nm: 450\.0 nm is none of them"
     ):
         hf.fit(([450.0, 650.0], [0.2, 0.3]), plan=camera)
 
@@ -207,6 +206,63 @@ def test_what_a_plan_fitted_is_sampled_on_its_bands_alone(camera):
     plain = hf.fit(([450.0, 650.0], [0.2, 0.3]), free=["water"])
     with pytest.raises(hf.HyliosError, match="is not on an instrument's bands"):
         hf.sample(plain, key=jax.random.key(0), surrogate=hf.load_surrogate().on([450.0, 650.0]))
+
+
+def narrow(nm=(450.0, 550.0, 650.0, 750.0), **scene):
+    """A plan that keeps all its ranges, without the solver."""
+    scene = hf.Scene(list(nm), **scene)
+    return planning.Plan(
+        scene, TOLERANCE, dict.fromkeys(scene.ranges, 1.0), {}, {}, (), "surrogate", "small", 8, 1,
+        scene.wavelength_nm, np.zeros(4), np.eye(4), 0.001, {},
+    )  # fmt: skip
+
+
+def test_ranges_may_end_where_the_surrogate_does():
+    plan = narrow()  # those of the table
+    assert plan.scene.ranges["pheomelanin"] == (0.2, 20.0)
+    bands = plan.simulate(hf.Specimen.preset("S3")).reflectance
+    result = hf.fit((plan.scene.centre_nm, bands), noise=0.005, plan=plan)
+    assert result.outcome.code == "fitted"
+    assert set(result.names) == set(plan.scene.ranges)
+
+
+def test_skin_of_the_other_form_is_the_plans_also_where_its_surrogate_is_asked():
+    dark = hf.Specimen.preset("S4").replace(blood_papillary=1.0)
+    plan = narrow(ranges=RANGES | {"melanosome_basale": (0.5, 12.0)}, specimen=dark)
+    row = dark.parameters(plan.surrogate.names)
+    expected = plan.reflectance([dark.replace(colloidal_melanin=2.0, blood_reticular=1.0)])[0]
+    row[plan.surrogate.names.index("colloidal_melanin")] = 2.0
+    row[plan.surrogate.names.index("blood_reticular")] = 1.0
+    np.testing.assert_allclose(plan.surrogate(row), expected, atol=1e-6)
+    spectrum = plan.scene.centre_nm, expected
+    result = hf.fit(spectrum, noise=0.003, plan=plan)
+    assert result.form == "dispersed"
+    assert result.residual_rms < 0.003
+
+
+def test_what_is_dropped_is_part_of_the_noise(camera):
+    lost = {**camera.dropped, "lipids": 0.03}
+    coarse = dataclasses.replace(camera, dropped=lost)
+    expected = np.hypot(0.03, camera.dropped["water"]) / np.sqrt(3.0)
+    assert coarse.dropped_sd == pytest.approx(expected)
+    bands = camera.scene.centre_nm, camera.simulate(fresh(camera.scene, 1)[0]).reflectance
+    near, far = (hf.fit(bands, noise=0.003, plan=plan) for plan in (camera, coarse))
+    more = coarse.dropped_sd**2 - camera.dropped_sd**2
+    np.testing.assert_allclose(far.sd**2 - near.sd**2, more, rtol=0.01)
+    assert far["melanin_mg_per_mL"].sd > 1.5 * near["melanin_mg_per_mL"].sd
+    nothing = dataclasses.replace(
+        camera, kept={}, dropped={**camera.kept, **camera.dropped}, held=dict.fromkeys(RANGES, 1.0)
+    )
+    with pytest.raises(hf.HyliosError, match="nothing that varies in the scene matters"):
+        hf.fit(bands, plan=nothing)
+
+
+def test_bands_that_their_wavelengths_do_not_tell_apart_are_refused():
+    nm = np.arange(400.0, 701.0, 10.0)
+    wide = np.exp(-0.5 * ((nm - 550.0) / np.array([[15.0], [60.0]])) ** 2)
+    on = hf.load_surrogate().on(nm, wide)
+    with pytest.raises(hf.HyliosError, match=r"550\.0 nm is none of them, or more than one"):
+        hf.fit((np.add(on.wavelength_nm, (0.0, 1e-9)), [0.2, 0.3]), on)
 
 
 def test_a_scene_that_no_surrogate_knows_is_not_fitted(camera):

@@ -139,8 +139,14 @@ def test_within_ranges_all_is_as_likely_whatever_the_rest_is(draws):
     assert abs(np.corrcoef(orders, some["blood_reticular"])[0, 1]) < 0.03
     elsewhere = draws[:, NAMES.index("blood_reticular")]
     assert np.median(some["blood_reticular"]) == pytest.approx(np.median(elsewhere), rel=0.05)
-    with pytest.raises(HyliosError, match=r"water from 0.1 to 1 is outside .* range 0\.\d+ to"):
-        statevector.state_vector(NAMES, LOWER, UPPER, ranges={"water": (0.1, 1.0)})
+    for ranges, says in (
+        ({"water": (0.1, 1.0)}, r"water = 0.1 is outside the surrogate's range 0\.\d+ to"),
+        ({"water": (1.0, 1.0)}, "water from 1 to 1: expected two rising values"),
+        ({"colour": (0.0, 1.0)}, "colour from 0 to 1: expected two rising values of one that is"),
+        ({"melanosome_granulosum": (1.0, 2.0)}, "of one that is free"),
+    ):
+        with pytest.raises(HyliosError, match=says):
+            statevector.state_vector(NAMES, LOWER, UPPER, fix=fixed, ranges=ranges)
 
 
 def test_what_is_not_free_stays_at_the_median_without_conditioning():

@@ -37,6 +37,7 @@ class ToyMember(eqx.Module):
     coefficients: np.ndarray  # (6, B): eumelanin, pheomelanin, oxy, deoxy, water, lipids
     scattering: np.ndarray  # (B,)
     sieve: np.ndarray  # ()
+    projected = False
 
     def surface_at(self, parameters):
         return 0.04
