@@ -481,7 +481,9 @@ def _once(function: Callable[[Any], Array]) -> Callable[[Any], Array]:
     """Compiled for the widest vectors. Such a program is no part of another: where one is traced,
     it still answers with numbers."""
 
-    @partial(jax.jit, compiler_options=VECTORS)
+    on_cpu = jax.default_backend() == "cpu"
+
+    @partial(jax.jit, compiler_options=VECTORS if on_cpu else None)
     def compiled(rows: Any) -> Array:
         if rows.ndim != 2 or len(rows) <= 2 * BLOCK:
             return function(rows)
