@@ -186,9 +186,10 @@ def _seconds(call: Callable[[], Any], repeats: int = 5) -> float:
 
 def draw(result: dict[str, Any], path: Any) -> None:
     """Error and time against the tolerance, and what was dropped at each."""
-    figure = _shared.figure(13.0, 9.5)
-    grid = figure.add_gridspec(2, 12, height_ratios=(1, 1.25))
-    errors, times, fits = (figure.add_subplot(grid[0, i : i + 4]) for i in (0, 4, 8))
+    figure = _shared.figure(14.0, 9.5)
+    above, below = figure.subfigures(2, 1, height_ratios=(1, 1.25))
+    errors, times, fits = above.subplots(1, 3)
+    kept = below.subplots(1, len(result["scenes"]))
     tolerances = np.array(result["tolerances"])
     for i, (name, scene) in enumerate(result["scenes"].items()):
         colour = _shared.COLOURS[i]
@@ -211,7 +212,7 @@ def draw(result: dict[str, Any], path: Any) -> None:
                 tolerances, [s[fit]["seconds"] for s in steps], style, color=colour, ms=4,
                 mfc=colour if fit == "fit" else "white",
             )  # fmt: skip
-        _dropped(figure.add_subplot(grid[1, 3 * i : 3 * i + 3]), name, steps)
+        _dropped(kept[i], name, steps)
     errors.plot(tolerances, tolerances, color="black", lw=1, ls="--", label="tolerance")
     for axes in (errors, times, fits):
         axes.set_xscale("log")
@@ -226,11 +227,11 @@ def draw(result: dict[str, Any], path: Any) -> None:
     _shared.logarithmic(fits.yaxis)
     _shared.tidy(
         errors, "tolerance (reflectance)", "error on fresh specimens",
-        "filled: largest of any band and specimen; open: RMS",
+        "filled: largest of all; open: RMS",
     )  # fmt: skip
     _shared.tidy(
         times, "tolerance (reflectance)", "times faster than everything at order 8",
-        "time saved; numbers: wavelengths that are solved",
+        "numbers: wavelengths that are solved",
     )  # fmt: skip
     _shared.tidy(
         fits, "tolerance, and noise of the bands", "core time of a fit (s)",
