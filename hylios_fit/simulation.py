@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -15,9 +15,6 @@ from hylios_fit.errors import HyliosError
 from hylios_fit.skin import Specimen
 from hylios_fit.threads import side_by_side
 from hylios_fit.units import WAVELENGTH_MAX, WAVELENGTH_MIN
-
-if TYPE_CHECKING:
-    from hylios_fit.planning import Plan
 
 METHODS = ("walker", "analog", "adding", "surrogate")
 FIRST = 2 * walker.BATCH  # rays before a tolerance is asked for, where no pilot says how many
@@ -52,6 +49,12 @@ class Curve:
     note: str = ""
 
 
+class Planned(Protocol):
+    """What answers for a scene (`planning.Plan`)."""
+
+    def simulate(self, specimen: Specimen) -> Curve: ...
+
+
 def simulate(
     specimen: Specimen,
     wavelengths: Any = None,
@@ -63,7 +66,7 @@ def simulate(
     tolerance: float | None = None,
     smooth_surface: bool = False,
     independent_particles: bool = False,
-    plan: Plan | None = None,
+    plan: Planned | None = None,
     progress: bool = False,
 ) -> Curve:
     """Reflectance of `specimen` at `wavelengths` (nm, 250 to 2500) and `incidence` (degrees).
