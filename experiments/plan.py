@@ -87,6 +87,8 @@ def _scene(scene: Scene, seed: int) -> dict[str, Any]:
     truth = truth @ scene.weights.T
     many = (specimens * (-(-TIMED // FRESH)))[:TIMED]
     full = _seconds(lambda: _whole(scene, many)) / TIMED
+    large = load_surrogate().on(scene.wavelength_nm, scene.response)
+    form: dict[str, Any] = {"melanosome_form": scene.specimen.melanosome_form}
     steps = []
     for tolerance in TOLERANCES:
         start = time.perf_counter()
@@ -113,9 +115,7 @@ def _scene(scene: Scene, seed: int) -> dict[str, Any]:
                 "seconds": _shared.significant(_seconds(lambda m=made: _planned(m, many)) / TIMED),
                 "planning_s": _shared.significant(took, 2),
                 "fit": _fitted(rows, measured, tolerance, plan=made),
-                "usual_fit": _fitted(
-                    rows, measured, tolerance, surrogate=_bands(scene), fix=_form(scene)
-                ),
+                "usual_fit": _fitted(rows, measured, tolerance, surrogate=large, fix=form),
             }
         )
     return {"seconds": _shared.significant(full), "order": adding.ORDER, "steps": steps}
@@ -130,15 +130,6 @@ def _whole(scene: Scene, specimens: list[Specimen]) -> np.ndarray:
 
 def _planned(made: Plan, specimens: list[Specimen]) -> np.ndarray:
     return made.reflectance(specimens)
-
-
-def _bands(scene: Scene) -> Any:
-    """The large surrogate on the scene's bands."""
-    return load_surrogate().on(scene.wavelength_nm, scene.response)
-
-
-def _form(scene: Scene) -> dict[str, str]:
-    return {"melanosome_form": scene.specimen.melanosome_form}
 
 
 def _fitted(rows: np.ndarray, measured: Any, noise: float, **how: Any) -> dict[str, Any]:

@@ -359,7 +359,7 @@ def _noise_model(noise: Any, spectra: Spectra) -> tuple[Any, Any, bool]:
             raise HyliosError("noise: expected a covariance, got one with variances not above 0")
         return "given as a covariance", lambda reflectance: given, False
     instrument.noise_sd(wavelength, np.zeros(wavelength.size), noise)  # refuses what is no noise
-    if text == "given for each band":
+    if noise is not None and noise is not spectra.noise and np.ndim(noise):  # that is sorted
         noise = np.asarray(noise, dtype=np.float64)[rising]
 
     def covariance(reflectance: np.ndarray) -> np.ndarray:

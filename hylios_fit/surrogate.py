@@ -474,13 +474,12 @@ def _holds_tracers(tree: Any) -> bool:
 
 @lru_cache(maxsize=32)
 def _compiled(member: Member) -> Callable[[Any], Array]:
-    return _once(member._evaluate)
+    return _jitted(member._evaluate)
 
 
-def _once(function: Callable[[Any], Array]) -> Callable[[Any], Array]:
+def _jitted(function: Callable[[Any], Array]) -> Callable[[Any], Array]:
     """Compiled for the widest vectors. Such a program is no part of another: where one is traced,
     it still answers with numbers."""
-
     on_cpu = jax.default_backend() == "cpu"
 
     @partial(jax.jit, compiler_options=VECTORS if on_cpu else None)
@@ -518,8 +517,8 @@ def _ready(surrogate: Surrogate) -> _Ready:
         lower, upper = np.asarray(member.lower, float), np.asarray(member.upper, float)
         slack = SLACK * (upper - lower)
         box = [np.append(x, _number(form)).astype(dtype) for x in (lower - slack, upper + slack)]
-        forms.append((*box, _once(lambda p, m=member: m._evaluate(p[..., :-1]))))
-    return _Ready(len(surrogate.names), dtype, tuple(forms), _once(surrogate._evaluate))
+        forms.append((*box, _jitted(lambda p, m=member: m._evaluate(p[..., :-1]))))
+    return _Ready(len(surrogate.names), dtype, tuple(forms), _jitted(surrogate._evaluate))
 
 
 # --- the file ---------------------------------------------------------------------------------
